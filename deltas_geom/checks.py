@@ -1,0 +1,68 @@
+"""Shape checks: the words of every shape error in the package."""
+
+import torch
+from torch import Tensor
+
+
+class ShapeError(ValueError):
+    """A tensor's trailing shape differs from what the operation documents."""
+
+
+def check_shapes(**named: tuple[Tensor, str]) -> None:
+    """Raise :class:`ShapeError` unless every tensor ends in its documented dims.
+
+    A dim is a number, which must match, or a letter, which must have one size in all
+    tensors of the call. Leading batch dims are free.
+
+    Args:
+        **named: ``name=(tensor, "V 3 4")``.
+
+    Raises:
+        ShapeError: a trailing shape differs, or two tensors disagree on a letter.
+
+    Example:
+        >>> import torch
+        >>> check_shapes(pixels=(torch.zeros(7, 3), "N 2"))
+        Traceback (most recent call last):
+        ...
+        deltas_geom.checks.ShapeError: pixels must have shape (*B, N, 2), got (7, 3)
+    """
+    seen: dict[str, tuple[int, str]] = {}
+    for name, (tensor, spec) in named.items():
+        dims = spec.split()
+        shape = tuple(tensor.shape)
+        tail = shape[len(shape) - len(dims) :] if len(shape) >= len(dims) else None
+        wrong = tail is None or any(
+            dim.isdigit() and int(dim) != size for dim, size in zip(dims, tail, strict=True)
+        )
+        if tail is None or wrong:
+            wanted = ", ".join(["*B", *dims])
+            raise ShapeError(f"{name} must have shape ({wanted}), got {shape}")
+        for dim, size in zip(dims, tail, strict=True):
+            if dim.isdigit():
+                continue
+            size_before, name_before = seen.setdefault(dim, (size, name))
+            if size != size_before:
+                raise ShapeError(
+                    f"{name} has {dim} = {size} but {name_before} has {dim} = {size_before}; "
+                    f"{name} must have shape (*B, {', '.join(dims)}), got {shape}"
+                )
+
+
+def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:
+    """The shape to which leading batch dims broadcast."""
+    return torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
+
+
+def check_depth_range(depth_range: tuple[float, float]) -> None:
+    """Raise ``ValueError`` unless ``0 < near < far`` (far may be infinite)."""
+    near, far = depth_range
+    if not 0 < near < far:
+        raise ValueError(f"depth_range must be (near, far) with 0 < near < far, got {depth_range}")
+
+
+def check_image_size(image_size: tuple[int, int]) -> None:
+    """Raise ``ValueError`` unless ``image_size`` is (height, width) of at least one pixel."""
+    height, width = image_size
+    if height < 1 or width < 1:
+        raise ValueError(f"image_size must be (height, width) >= (1, 1), got {image_size}")

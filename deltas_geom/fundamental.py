@@ -1,0 +1,98 @@
+"""Fundamental matrices, epipolar lines and distances to them."""
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import check_shapes
+from deltas_geom.homogeneous import to_homogeneous
+from deltas_geom.poses import relative_pose
+from deltas_geom.views import PosedViews
+
+
+def cross_matrix(vectors: Tensor) -> Tensor:
+    """[v]x with [v]x u = v x u: ``(*B, 3)`` to ``(*B, 3, 3)``."""
+    x, y, z = vectors.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(rows, dim=-1).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def inverse_intrinsics(K: Tensor) -> Tensor:
+    """Inverse of upper triangular intrinsics ``(*B, 3, 3)``, in closed form."""
+    fx, fy, skew = K[..., 0, 0], K[..., 1, 1], K[..., 0, 1]
+    cx, cy = K[..., 0, 2], K[..., 1, 2]
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    rows = [
+        1 / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy),
+        zero, 1 / fy, -cy / fy,
+        zero, zero, one,
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(K.shape)
+
+
+def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> Tensor:
+    """Fundamental matrix F with x_source^T F x_anchor = 0 for pixels of one point.
+
+    Args:
+        views: the cameras, ``(*B, V)``.
+        anchor: index of the view whose pixels F is applied to.
+        source: index of the view that gets the lines.
+
+    Returns:
+        ``(*B, 3, 3)``, F = K_s^-T [t]x R K_a^-1, not normalised: its scale follows the
+        baseline, and at zero baseline it is zero.
+
+    Source: Hartley and Zisserman, 2nd ed., equation 9.2; the paper, section 3.2.
+    """
+    source_from_anchor = relative_pose(
+        views.cam_from_world[..., source, :, :], views.cam_from_world[..., anchor, :, :]
+    )
+    essential = cross_matrix(source_from_anchor[..., :3, 3]) @ source_from_anchor[..., :3, :3]
+    K_anchor, K_source = views.K[..., anchor, :, :], views.K[..., source, :, :]
+    return inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
+
+
+def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
+    r"""Lines of the second view on which the first view's pixels must lie.
+
+    A line :math:`(a, b, c)` holds the pixels with :math:`ax + by + c = 0`. Its normal
+    :math:`(a, b)` has unit length, so the dot product with a homogeneous pixel is a signed
+    distance in pixels.
+
+    Args:
+        fundamental: ``(*B, 3, 3)``, second view from first: x2^T F x1 = 0.
+        pixels: ``(*B, N, 2)`` in the first view. ``*B`` broadcasts.
+
+    Returns:
+        ``(*B, N, 3)`` lines. A pixel within rounding of the epipole has none: its line is
+        zero and passes no gradient.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Source: Hartley and Zisserman, 2nd ed., section 9.2.
+    """
+    check_shapes(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
+    lines = to_homogeneous(pixels) @ fundamental.mT
+    squared = lines[..., :2].square().sum(dim=-1, keepdim=True)
+    scale = to_homogeneous(pixels).abs() @ fundamental[..., :2, :].abs().mT
+    noise = 16 * torch.finfo(lines.dtype).eps * scale.amax(dim=-1, keepdim=True)
+    has_line = squared > noise.square()
+    # Double where: the unused branch must not turn the gradient into NaN.
+    safe = torch.where(has_line, squared, 1.0)
+    return torch.where(has_line, lines * safe.rsqrt(), 0.0)
+
+
+def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """Signed distance of the second view's pixels from the first view's epipolar lines.
+
+    Args:
+        fundamental: ``(*B, 3, 3)``, second view from first.
+        first: ``(*B, N, 2)`` pixels of the first view.
+        second: ``(*B, N, 2)`` pixels of the second view.
+
+    Returns:
+        ``(*B, N)`` pixels; 0 where there is no line.
+    """
+    check_shapes(first=(first, "N 2"), second=(second, "N 2"))
+    return (epipolar_lines(fundamental, first) * to_homogeneous(second)).sum(dim=-1)

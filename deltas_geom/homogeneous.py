@@ -1,0 +1,41 @@
+"""To and from homogeneous coordinates, without a division by zero."""
+
+import torch
+from torch import Tensor
+
+
+def to_homogeneous(coordinates: Tensor) -> Tensor:
+    """Append a one: ``(*B, D)`` to ``(*B, D + 1)``.
+
+    Example:
+        >>> to_homogeneous(torch.tensor([2.0, 3.0]))
+        tensor([2., 3., 1.])
+    """
+    return torch.cat([coordinates, torch.ones_like(coordinates[..., :1])], dim=-1)
+
+
+def safe_divide(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
+    """``numerator / denominator`` where ``where`` holds, elsewhere 0 with zero gradient.
+
+    Args:
+        numerator: any shape that broadcasts with the others.
+        denominator: not zero where ``where`` holds.
+        where: bool.
+    """
+    # Double where: the unused branch must not turn the gradient into NaN.
+    return torch.where(where, numerator / torch.where(where, denominator, 1.0), 0.0)
+
+
+def from_homogeneous(coordinates: Tensor) -> Tensor:
+    """Divide by the last coordinate: ``(*B, D + 1)`` to ``(*B, D)``.
+
+    Coordinates at infinity (last coordinate exactly 0) give 0 with zero gradient; test
+    ``coordinates[..., -1] != 0`` to tell them apart.
+
+    Example:
+        >>> from_homogeneous(torch.tensor([[4.0, 6.0, 2.0], [1.0, 1.0, 0.0]]))
+        tensor([[2., 3.],
+                [0., 0.]])
+    """
+    last = coordinates[..., -1:]
+    return safe_divide(coordinates[..., :-1], last, last != 0)

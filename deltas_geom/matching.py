@@ -1,0 +1,265 @@
+"""Correlation along epipolar samples, soft-argmax, and matches of both kinds.
+
+`match_per_view` decides in each source alone, as the paper does. `match_joint` averages the
+evidence of all sources at common inverse depths before it decides, so that one wrong mode in
+one view cannot pull the point away.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.homogeneous import safe_divide
+from deltas_geom.pixels import normalize_pixels
+from deltas_geom.sampling import Samples, sample_inv_depths
+from deltas_geom.views import PosedViews
+
+_CACHED_ELEMENTS = 1 << 18  # elements of one view's correlation maps in a chunk: 1 MB
+
+
+class Matches(NamedTuple):
+    """Where keypoints of the anchor are seen; ready for :func:`deltas_geom.triangulate`.
+
+    Attributes:
+        pixels: ``(*B, V, N, 2)``; entry 0 is the keypoint itself, sources follow in order.
+        weights: ``(*B, V, N)`` not negative; the anchor's is 1.
+        covariance: ``(*B, V, N, 2, 2)`` px^2; the anchor's is 0.
+        mask: ``(*B, V, N)`` bool: the view has a match.
+    """
+
+    pixels: Tensor
+    weights: Tensor
+    covariance: Tensor
+    mask: Tensor
+
+
+class SoftArgmax(NamedTuple):
+    """The mean place of a distribution over places, and how sure it is.
+
+    Attributes:
+        position: ``(*B, D)`` mean.
+        covariance: ``(*B, D, D)``.
+        peak: ``(*B)`` largest probability; 0 where every place is masked.
+        mass: ``(*B)`` share of the probability inside the window (1 without a window).
+        entropy: ``(*B)`` of the whole distribution, nats.
+    """
+
+    position: Tensor
+    covariance: Tensor
+    peak: Tensor
+    mass: Tensor
+    entropy: Tensor
+
+
+def correlate(
+    descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
+) -> Tensor:
+    """Dot products of keypoint descriptors with the sources' features at samples.
+
+    Correlation comes first and the scalar map is sampled: bilinear reading is linear, so the
+    result is that of reading D channels and then multiplying, at a fraction of the memory.
+
+    Args:
+        descriptors: ``(*B, N, D)`` of the anchor's keypoints.
+        feature_map: ``(*B, V-1, D, h, w)`` of the sources, any stride.
+        samples: places in the sources.
+        image_size: (height, width) of the sources' images.
+
+    Returns:
+        ``(*B, V-1, N, O, S)``; 0 where the sample is masked.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Source: the paper, equation 1.
+    """
+    check_shapes(
+        descriptors=(descriptors, "N D"),
+        feature_map=(feature_map, "S D h w"),
+        samples=(samples.pixels, "S N O M 2"),
+    )
+    batch = batch_shape(
+        descriptors.shape[:-2] + (1,), feature_map.shape[:-3], samples.pixels.shape[:-4]
+    )
+    height, width = feature_map.shape[-2:]
+    features = feature_map.flatten(-2)
+    grid = normalize_pixels(samples.pixels, image_size=image_size).to(features.dtype)
+    grid = grid.expand(*batch, *grid.shape[-4:])
+    read = [grid.new_zeros(*batch, 0, *grid.shape[-3:-1])]
+    # A chunk of correlation maps should stay in the cache between writing and sampling it.
+    chunk = max(8, _CACHED_ELEMENTS // (height * width))
+    for first in range(0, descriptors.shape[-2], chunk):
+        some = slice(first, first + chunk)
+        maps = descriptors[..., some, :].unsqueeze(-3) @ features
+        maps = maps.expand(*batch, *maps.shape[-2:]).reshape(-1, 1, height, width)
+        places = grid[..., some, :, :, :]
+        scores = F.grid_sample(
+            maps, places.flatten(0, -4), padding_mode="border", align_corners=False
+        )
+        read.append(scores.reshape(places.shape[:-1]))
+    correlation = torch.cat(read, dim=-3)
+    return torch.where(samples.mask, correlation, 0.0)
+
+
+def soft_argmax(
+    logits: Tensor, positions: Tensor, *, mask: Tensor | None = None, window: int | None = None
+) -> SoftArgmax:
+    """Mean position under the softmax of logits, optionally in a window around the peak.
+
+    Args:
+        logits: ``(*B, S)``.
+        positions: ``(*B, S, D)`` or broadcastable, for example pixels or inverse depths.
+        mask: ``(*B, S)`` bool, True = possible; the others may hold anything.
+        window: keep only places at most this many steps from the peak, so that a second mode
+            elsewhere does not pull the mean between the two.
+
+    Returns:
+        Finite numbers always; where every place is masked all of them are 0.
+
+    Source: the paper, equations 2 and 3.
+
+    Example:
+        >>> soft_argmax(torch.tensor([0.0, 50.0, 0.0]), torch.tensor([[1.0], [2.0], [3.0]])).position
+        tensor([2.])
+    """
+    check_shapes(logits=(logits, "S"), positions=(positions, "S D"))
+    possible = torch.ones_like(logits, dtype=torch.bool) if mask is None else mask
+    lowest = torch.finfo(logits.dtype).min / 4
+    probability = torch.where(possible, logits, lowest).softmax(dim=-1)
+    probability = torch.where(possible, probability, 0.0)
+    peak, place = probability.max(dim=-1)
+    entropy = -torch.special.xlogy(probability, probability.clamp_min(1e-30)).sum(dim=-1)
+    near = probability
+    if window is not None:
+        index = torch.arange(logits.shape[-1], device=logits.device)
+        near = torch.where((index - place[..., None]).abs() <= window, probability, 0.0)
+    mass = near.sum(dim=-1)
+    share = safe_divide(near, mass[..., None], (mass > 0)[..., None])
+    positions = torch.where(possible[..., None], positions, 0.0)
+    position = (share[..., None] * positions).sum(dim=-2)
+    offset = positions - position.unsqueeze(-2)
+    covariance = (share[..., None] * offset).mT @ offset
+    return SoftArgmax(position, covariance, peak, mass, entropy)
+
+
+def matches_from_sources(
+    keypoints: Tensor, pixels: Tensor, weights: Tensor, covariance: Tensor, mask: Tensor
+) -> Matches:
+    """Put the anchor's keypoints (weight 1, no covariance) before the sources' matches.
+
+    Args:
+        keypoints: ``(*B, N, 2)``.
+        pixels: ``(*B, V-1, N, 2)``.
+        weights: ``(*B, V-1, N)``.
+        covariance: ``(*B, V-1, N, 2, 2)``.
+        mask: ``(*B, V-1, N)``.
+    """
+    batch = weights.shape[:-2]
+    anchor = keypoints.expand(*batch, *keypoints.shape[-2:]).unsqueeze(-3)
+    ones = torch.ones_like(weights[..., :1, :])
+    return Matches(
+        torch.cat([anchor, pixels], dim=-3),
+        torch.cat([ones, weights], dim=-2),
+        torch.cat([torch.zeros_like(covariance[..., :1, :, :, :]), covariance], dim=-4),
+        torch.cat([torch.ones_like(mask[..., :1, :]), mask], dim=-2),
+    )
+
+
+def match_per_view(
+    keypoints: Tensor, scores: Tensor, samples: Samples, *, window: int | None = None
+) -> Matches:
+    """Match in every source alone: soft-argmax over all its samples, weight = peak.
+
+    Args:
+        keypoints: ``(*B, N, 2)`` of the anchor.
+        scores: ``(*B, V-1, N, O, S)`` logits, for example a scaled :func:`correlate`.
+        samples: the places scored.
+        window: see :func:`soft_argmax`; only without offsets (O = 1).
+
+    Source: the paper, section 3.2, equations 2 and 3.
+    """
+    if window is not None and scores.shape[-2] != 1:
+        raise ValueError("window needs samples without offsets: steps are along one line")
+    found = soft_argmax(
+        scores.flatten(-2),
+        samples.pixels.flatten(-3, -2),
+        mask=samples.mask.flatten(-2),
+        window=window,
+    )
+    return matches_from_sources(
+        keypoints, found.position, found.peak, found.covariance, samples.mask.flatten(-2).any(-1)
+    )
+
+
+def match_joint(
+    views: PosedViews,
+    keypoints: Tensor,
+    scores: Tensor,
+    samples: Samples,
+    *,
+    image_size: tuple[int, int],
+    window: int | None = 2,
+) -> Matches:
+    """Match in all sources at once: mean score at common inverse depths, one soft-argmax.
+
+    Args:
+        views: the anchor (view 0) and its V-1 sources.
+        keypoints: ``(*B, N, 2)`` of the anchor.
+        scores: ``(*B, V-1, N, 1, S)`` logits at ``samples``.
+        samples: from :func:`deltas_geom.sample_inv_depths`.
+        image_size: (height, width) of the sources.
+        window: see :func:`soft_argmax`.
+
+    Returns:
+        The projections of the one decided depth into the sources that can see it, weight =
+        peak of the joint distribution.
+    """
+    seen = samples.mask.squeeze(-2)
+    count = seen.sum(dim=-3)
+    mean = safe_divide(torch.where(seen, scores.squeeze(-2), 0.0).sum(dim=-3), count, count > 0)
+    inv_depth = samples.inv_depth.select(-3, 0)
+    found = soft_argmax(mean, inv_depth[..., None], mask=count > 0, window=window)
+    return matches_at(
+        views,
+        keypoints,
+        found.position.squeeze(-1),
+        found.covariance[..., 0, 0],
+        weights=found.peak,
+        image_size=image_size,
+    )
+
+
+def matches_at(
+    views: PosedViews,
+    keypoints: Tensor,
+    inv_depth: Tensor,
+    variance: Tensor,
+    *,
+    weights: Tensor,
+    image_size: tuple[int, int],
+) -> Matches:
+    """The matches that one inverse depth per keypoint implies.
+
+    Args:
+        views: the anchor (view 0) and its V-1 sources.
+        keypoints: ``(*B, N, 2)``.
+        inv_depth: ``(*B, N)`` 1/m.
+        variance: ``(*B, N)`` of the inverse depth, 1/m^2.
+        weights: ``(*B, N)``.
+        image_size: (height, width) of the sources.
+    """
+    at = torch.stack([inv_depth, inv_depth + variance.clamp_min(0).sqrt().detach()], dim=-1)
+    places = sample_inv_depths(views, keypoints, at, image_size=image_size)
+    pixels, beside = places.pixels.squeeze(-3).unbind(dim=-2)
+    step = torch.where(places.mask.squeeze(-2).all(-1)[..., None], beside - pixels, 0.0)
+    seen = places.mask[..., 0, 0]
+    return matches_from_sources(
+        keypoints,
+        pixels,
+        weights.unsqueeze(-2).expand(seen.shape),
+        step[..., :, None] * step[..., None, :],
+        seen,
+    )

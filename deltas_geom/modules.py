@@ -1,0 +1,97 @@
+"""The operations as modules, for pipelines that are built from modules."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+from torch import Tensor, nn
+
+from deltas_geom.rasterize import SparseDepth, rasterize_depth
+from deltas_geom.sampling import Samples, sample_segments
+from deltas_geom.segments import epipolar_segments
+from deltas_geom.triangulation import Triangulation, triangulate
+from deltas_geom.views import PosedViews
+
+
+class EpipolarSampler(nn.Module):
+    """:func:`epipolar_segments` and :func:`sample_segments` with fixed settings."""
+
+    def __init__(
+        self,
+        num_samples: int,
+        *,
+        depth_range: tuple[float, float],
+        spacing: Literal["inv_depth", "pixels"] = "inv_depth",
+        offsets: Sequence[float] = (),
+    ) -> None:
+        super().__init__()
+        self.num_samples = num_samples
+        self.depth_range = depth_range
+        self.spacing = spacing
+        self.offsets = tuple(offsets)
+
+    def forward(self, views: PosedViews, pixels: Tensor, image_size: tuple[int, int]) -> Samples:
+        """Samples of the anchor's ``pixels`` (*B, N, 2) in every source."""
+        segments = epipolar_segments(
+            views, pixels, depth_range=self.depth_range, image_size=image_size
+        )
+        return sample_segments(
+            segments,
+            self.num_samples,
+            spacing=self.spacing,
+            offsets=self.offsets,
+            image_size=image_size,
+        )
+
+
+class Triangulator(nn.Module):
+    """:func:`triangulate` with fixed settings."""
+
+    def __init__(self, *, frame: Literal["rig", "world"] = "rig", covariance: bool = False) -> None:
+        super().__init__()
+        self.frame = frame
+        self.covariance = covariance
+
+    def forward(
+        self,
+        proj: Tensor,
+        pixels: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> Triangulation:
+        """Points of matched ``pixels`` (*B, V, N, 2)."""
+        return triangulate(
+            proj, pixels, weights, mask, frame=self.frame, covariance=self.covariance
+        )
+
+
+class DepthRasterizer(nn.Module):
+    """:func:`rasterize_depth` with fixed settings."""
+
+    def __init__(
+        self,
+        *,
+        reduce: Literal["front", "mean"] = "front",
+        splat: Literal["pixel", "bilinear"] = "pixel",
+    ) -> None:
+        super().__init__()
+        self.reduce = reduce
+        self.splat = splat
+
+    def forward(
+        self,
+        pixels: Tensor,
+        depth: Tensor,
+        image_size: tuple[int, int],
+        mask: Tensor | None = None,
+        weights: Tensor | None = None,
+    ) -> SparseDepth:
+        """Sparse depth image of points at ``pixels`` (*B, N, 2)."""
+        return rasterize_depth(
+            pixels,
+            depth,
+            image_size=image_size,
+            mask=mask,
+            weights=weights,
+            reduce=self.reduce,
+            splat=self.splat,
+        )

@@ -1,0 +1,99 @@
+"""The pixel convention: (x, y), pixel centres at integers, image spans [-0.5, W - 0.5].
+
+Everything that knows how a pixel becomes a `grid_sample` coordinate, a pixel of a resized
+or cropped image, or a place in a feature map is here and nowhere else.
+"""
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import check_image_size, check_shapes
+
+
+def pixel_grid(
+    image_size: tuple[int, int],
+    *,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Centres of all pixels in raster order, ``(H * W, 2)``.
+
+    Example:
+        >>> pixel_grid((1, 2))
+        tensor([[0., 0.],
+                [1., 0.]])
+    """
+    check_image_size(image_size)
+    height, width = image_size
+    y, x = torch.meshgrid(
+        torch.arange(height, device=device, dtype=dtype),
+        torch.arange(width, device=device, dtype=dtype),
+        indexing="ij",
+    )
+    return torch.stack([x, y], dim=-1).reshape(-1, 2)
+
+
+def in_image(pixels: Tensor, *, image_size: tuple[int, int], border: float = 0.0) -> Tensor:
+    """Whether pixels ``(*B, 2)`` lie in the image, at least ``border`` px from its edge.
+
+    Returns:
+        ``(*B)`` bool.
+    """
+    height, width = image_size
+    x, y = pixels.unbind(dim=-1)
+    low = border - 0.5
+    return (x >= low) & (x <= width - 1 - low) & (y >= low) & (y <= height - 1 - low)
+
+
+def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
+    """Pixels ``(*B, 2)`` as `grid_sample` coordinates (``align_corners=False``).
+
+    The image spans [-1, 1] whatever its resolution, so the same coordinates read a feature
+    map of any stride: pixel p lies at (p + 0.5) / stride - 0.5 of the map.
+
+    Example:
+        >>> normalize_pixels(torch.tensor([-0.5, 1.5]), image_size=(2, 4))
+        tensor([-1.,  1.])
+    """
+    height, width = image_size
+    size = torch.tensor([width, height], device=pixels.device, dtype=pixels.dtype)
+    return (2 * pixels + 1) / size - 1
+
+
+def resize_pixels(
+    pixels: Tensor, *, old_size: tuple[int, int], new_size: tuple[int, int]
+) -> Tensor:
+    """Where pixels ``(*B, 2)`` of an image go when it is resized.
+
+    Example:
+        >>> resize_pixels(torch.tensor([0.0, 0.0]), old_size=(4, 4), new_size=(2, 2))
+        tensor([-0.2500, -0.2500])
+    """
+    scale = torch.tensor(
+        [new_size[1] / old_size[1], new_size[0] / old_size[0]],
+        device=pixels.device,
+        dtype=pixels.dtype,
+    )
+    return scale * (pixels + 0.5) - 0.5
+
+
+def resize_intrinsics(K: Tensor, *, old_size: tuple[int, int], new_size: tuple[int, int]) -> Tensor:
+    """Intrinsics ``(*B, 3, 3)`` of the resized image; each axis has its own scale.
+
+    Raises:
+        ShapeError: K is not ``(*B, 3, 3)``.
+        ValueError: a size is smaller than one pixel.
+    """
+    check_shapes(K=(K, "3 3"))
+    check_image_size(old_size)
+    check_image_size(new_size)
+    sx, sy = new_size[1] / old_size[1], new_size[0] / old_size[0]
+    change = [[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]
+    return torch.tensor(change, device=K.device, dtype=K.dtype) @ K
+
+
+def crop_intrinsics(K: Tensor, *, left: float, top: float) -> Tensor:
+    """Intrinsics ``(*B, 3, 3)`` of the image whose pixel (0, 0) was (left, top)."""
+    check_shapes(K=(K, "3 3"))
+    change = [[1, 0, -left], [0, 1, -top], [0, 0, 1]]
+    return torch.tensor(change, device=K.device, dtype=K.dtype) @ K

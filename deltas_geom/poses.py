@@ -1,0 +1,54 @@
+"""Rigid transforms ``b_from_a`` as 4x4 matrices: inverse, relative pose, validity."""
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import check_shapes
+
+
+def invert_pose(b_from_a: Tensor) -> Tensor:
+    """``a_from_b`` of rigid transforms ``(*B, 4, 4)``: transpose, no matrix inverse.
+
+    Example:
+        >>> b_from_a = torch.eye(4)
+        >>> b_from_a[0, 3] = 2.0
+        >>> invert_pose(b_from_a)[0, 3]
+        tensor(-2.)
+    """
+    check_shapes(b_from_a=(b_from_a, "4 4"))
+    rotation = b_from_a[..., :3, :3].mT
+    translation = -rotation @ b_from_a[..., :3, 3:]
+    return torch.cat([torch.cat([rotation, translation], dim=-1), b_from_a[..., 3:, :]], dim=-2)
+
+
+def relative_pose(b_from_world: Tensor, a_from_world: Tensor) -> Tensor:
+    """``b_from_a`` ``(*B, 4, 4)`` of two cameras posed in one world; ``*B`` broadcasts."""
+    return b_from_world @ invert_pose(a_from_world)
+
+
+def camera_centers(cam_from_world: Tensor) -> Tensor:
+    """World positions ``(*B, 3)`` of cameras ``(*B, 4, 4)``, metres."""
+    check_shapes(cam_from_world=(cam_from_world, "4 4"))
+    rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3:]
+    return -(rotation.mT @ translation).squeeze(-1)
+
+
+def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:
+    """Whether ``(*B, 4, 4)`` are finite rotations with a translation, ``(*B)`` bool.
+
+    A value check: it synchronises the device when its result is used in Python.
+
+    Args:
+        b_from_a: ``(*B, 4, 4)``.
+        tolerance: largest deviation of an entry of R R^T from the identity. Poses written
+            with six digits are within 1e-5; a scaled or sheared matrix is not within 1e-3.
+    """
+    check_shapes(b_from_a=(b_from_a, "4 4"))
+    rotation = b_from_a[..., :3, :3]
+    identity = torch.eye(4, device=b_from_a.device, dtype=b_from_a.dtype)
+    orthogonal = ((rotation @ rotation.mT - identity[:3, :3]).abs() <= tolerance).all(-1).all(-1)
+    proper = torch.linalg.det(rotation.nan_to_num()) > 0
+    last_row = ((b_from_a[..., 3, :] - identity[3]).abs() <= tolerance).all(dim=-1)
+    finite = b_from_a.isfinite().all(-1).all(-1)
+    rigid: Tensor = finite & orthogonal & proper & last_row
+    return rigid

@@ -1,0 +1,97 @@
+"""World points to pixels and back."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import check_shapes
+from deltas_geom.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.poses import invert_pose
+from deltas_geom.views import PosedViews
+
+
+class Projection(NamedTuple):
+    """Where world points appear.
+
+    Attributes:
+        pixels: ``(*B, V, N, 2)``; (0, 0) with zero gradient where the point is not in front.
+        depth: ``(*B, V, N)`` along each camera's z axis, metres; 0 where the point is not
+            finite or too far to represent.
+        in_front: ``(*B, V, N)`` bool: depth > 0, and the pixel and its gradient can be
+            represented (a point closer to the camera's plane than that has no pixel).
+    """
+
+    pixels: Tensor
+    depth: Tensor
+    in_front: Tensor
+
+
+def project(views: PosedViews, points: Tensor) -> Projection:
+    """Project world points into every view.
+
+    Args:
+        views: V cameras.
+        points: ``(*B, N, 3)`` in the world, metres. ``*B`` broadcasts with the views'.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Source: Hartley and Zisserman, 2nd ed., section 6.1.
+
+    Example:
+        >>> K = torch.tensor([[[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]])
+        >>> views = PosedViews(K, torch.eye(4)[None])
+        >>> project(views, torch.tensor([[0.0, 0.1, 2.0]])).pixels
+        tensor([[[50., 45.]]])
+    """
+    check_shapes(points=(points, "N 3"))
+    finite = points.isfinite().all(dim=-1)
+    # A NaN would reach the gradient of every camera through the product below.
+    known = torch.where(finite[..., None], points, 0.0)
+    homogeneous = to_homogeneous(known).unsqueeze(-3) @ views.proj.mT
+    exists = finite.unsqueeze(-2) & homogeneous.isfinite().all(dim=-1)
+    depth = torch.where(exists, homogeneous[..., 2], 0.0)
+    # Pixels and 1 / depth enter the gradient squared, times the size of the point.
+    small = torch.finfo(depth.dtype).tiny ** (1 / 3)
+    size = torch.maximum(homogeneous.abs().amax(dim=-1), known.abs().amax(dim=-1).unsqueeze(-2))
+    in_front = exists & (depth > small) & (depth > small * size.detach())
+    pixels = safe_divide(homogeneous[..., :2], depth[..., None], in_front[..., None])
+    return Projection(pixels, depth, in_front)
+
+
+def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
+    """World points seen at pixels of each view, at a depth along its z axis.
+
+    Args:
+        views: V cameras.
+        pixels: ``(*B, V, N, 2)``.
+        depth: ``(*B, V, N)`` metres.
+
+    Returns:
+        ``(*B, V, N, 3)`` world points, metres.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+    """
+    check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"), depth=(depth, "V N"))
+    rays = pixel_rays(views.K, pixels)
+    world_from_cam = invert_pose(views.cam_from_world)
+    return to_homogeneous(rays * depth[..., None]) @ world_from_cam[..., :3, :].mT
+
+
+def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
+    """Rays through pixels in the camera's own frame, scaled to depth 1.
+
+    Args:
+        K: ``(*B, 3, 3)`` upper triangular.
+        pixels: ``(*B, N, 2)``.
+
+    Returns:
+        ``(*B, N, 3)``; the last coordinate is 1.
+    """
+    check_shapes(K=(K, "3 3"), pixels=(pixels, "N 2"))
+    # Back substitution: exact for a camera and cheaper than a general inverse.
+    y = (pixels[..., 1] - K[..., 1, 2, None]) / K[..., 1, 1, None]
+    x = (pixels[..., 0] - K[..., 0, 2, None] - K[..., 0, 1, None] * y) / K[..., 0, 0, None]
+    return to_homogeneous(torch.stack([x, y], dim=-1))

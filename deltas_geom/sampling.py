@@ -1,0 +1,145 @@
+"""Places along epipolar segments, and feature maps read at pixels."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.homogeneous import safe_divide
+from deltas_geom.pixels import in_image, normalize_pixels
+from deltas_geom.segments import Segments, epipolar_rays
+from deltas_geom.views import PosedViews
+
+
+class Samples(NamedTuple):
+    """Places in the sources where a keypoint may be matched.
+
+    Attributes:
+        pixels: ``(*B, V-1, N, O, S, 2)``; O lines beside each other, S places along each.
+        inv_depth: ``(*B, V-1, N, S)`` inverse of the anchor's z, 1/m, from far to near.
+        mask: ``(*B, V-1, N, O, S)`` bool: the place can be read.
+    """
+
+    pixels: Tensor
+    inv_depth: Tensor
+    mask: Tensor
+
+
+def sample_segments(
+    segments: Segments,
+    num_samples: int,
+    *,
+    spacing: Literal["inv_depth", "pixels"] = "inv_depth",
+    offsets: Sequence[float] = (),
+    image_size: tuple[int, int] | None = None,
+) -> Samples:
+    """Spread samples evenly over each segment, from its far to its near end.
+
+    Args:
+        segments: from :func:`epipolar_segments`.
+        num_samples: S, at least 2.
+        spacing: even in inverse depth, or even in pixels.
+        offsets: distances of parallel lines from the segment, pixels; () is the segment
+            itself. The paper uses (-1, 0, 1) against errors of the poses.
+        image_size: (height, width); when given, offset samples outside are masked out.
+
+    Source: the paper, section 3.2.
+    """
+    if num_samples < 2:
+        raise ValueError(f"num_samples must be at least 2, got {num_samples}")
+    start, end = segments.start, segments.end
+    fraction = torch.linspace(0, 1, num_samples, device=start.device, dtype=start.dtype)
+    # Homogeneous interpolation: with r the foreshortening, a share s of the inverse depth
+    # lies at the share s r / (1 - s + s r) of the pixels.
+    ratio = segments.foreshortening[..., None]
+    if spacing == "inv_depth":
+        of_depth = fraction.expand(*ratio.shape[:-1], num_samples)
+        of_pixels = of_depth * ratio / (1 - of_depth + of_depth * ratio)
+    elif spacing == "pixels":
+        of_pixels = fraction.expand(*ratio.shape[:-1], num_samples)
+        of_depth = of_pixels / (ratio * (1 - of_pixels) + of_pixels)
+    else:
+        raise ValueError(f"spacing must be 'inv_depth' or 'pixels', got {spacing!r}")
+    low, high = segments.inv_depth_start[..., None], segments.inv_depth_end[..., None]
+    inv_depth = low + of_depth * (high - low)
+    pixels = start[..., None, :] + of_pixels[..., None] * (end - start)[..., None, :]
+
+    pixels = pixels.unsqueeze(-3)
+    if offsets:
+        along = end - start
+        length = along.square().sum(-1, keepdim=True)
+        moving = length > 0
+        unit = along * torch.where(moving, length, 1.0).rsqrt()
+        across = torch.stack([-unit[..., 1], unit[..., 0]], dim=-1)
+        shifts = torch.tensor(offsets, device=start.device, dtype=start.dtype)
+        pixels = pixels + shifts[:, None, None] * across[..., None, None, :]
+    mask = segments.visible[..., None, None].expand(pixels.shape[:-1])
+    if image_size is not None:
+        check_image_size(image_size)
+        mask = mask & in_image(pixels, image_size=image_size)
+    return Samples(pixels, inv_depth, mask)
+
+
+def sample_inv_depths(
+    views: PosedViews, pixels: Tensor, inv_depths: Tensor, *, image_size: tuple[int, int]
+) -> Samples:
+    """The same inverse depths in every source, so that views can be fused before a decision.
+
+    Args:
+        views: the anchor (view 0) and its V-1 sources.
+        pixels: ``(*B, N, 2)`` keypoints of the anchor.
+        inv_depths: ``(S,)`` or ``(*B, N, S)``, 1/m of the anchor's z, not negative.
+        image_size: (height, width) of the sources.
+
+    Returns:
+        Samples with O = 1. Where a sample falls behind a source or outside its image the mask
+        is False; behind, its pixel is (0, 0).
+
+    Raises:
+        ShapeError: a trailing shape differs.
+    """
+    check_image_size(image_size)
+    check_shapes(pixels=(pixels, "N 2"), inv_depths=(inv_depths, "S"))
+    rays = epipolar_rays(views, pixels)
+    inv_depth = inv_depths.unsqueeze(-3) if inv_depths.ndim > 1 else inv_depths
+    inv_depth = inv_depth.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depth.shape))
+    homogeneous = rays.at(inv_depth)
+    noise = 64 * torch.finfo(homogeneous.dtype).eps * rays.origin.abs().amax(-1)[..., None]
+    in_front = (homogeneous[..., 2] > noise) & rays.finite[..., None]
+    where = safe_divide(homogeneous[..., :2], homogeneous[..., 2:], in_front[..., None])
+    mask = in_front & in_image(where, image_size=image_size)
+    return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
+
+
+def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
+    """Read a feature map of any stride at pixels of the image, bilinearly.
+
+    Args:
+        feature_map: ``(*B, D, h, w)``, the image plane sampled coarser.
+        pixels: ``(*B, N, 2)`` in the image; beyond the map's outer centres its border is
+            continued. ``*B`` broadcasts with the map's.
+        image_size: (height, width) of the image.
+
+    Returns:
+        ``(*B, N, D)``.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Example:
+        >>> ramp = torch.arange(4.0).reshape(1, 1, 4)  # one row of four pixels
+        >>> sample_map(ramp, torch.tensor([[1.5, 0.0]]), image_size=(1, 4))
+        tensor([[1.5000]])
+    """
+    check_shapes(feature_map=(feature_map, "D h w"), pixels=(pixels, "N 2"))
+    batch = batch_shape(feature_map.shape[:-3], pixels.shape[:-2])
+    # The count, not -1: a reshape of no keypoints cannot infer it.
+    count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]
+    maps = feature_map.expand(*batch, *size).reshape(count, *size)
+    grid = normalize_pixels(pixels, image_size=image_size).to(feature_map.dtype)
+    grid = grid.expand(*batch, num, 2).reshape(count, 1, num, 2)
+    read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+    return read.squeeze(-2).mT.reshape(*batch, num, size[0])

@@ -1,0 +1,159 @@
+"""Epipolar segments: depth range ∩ in front of the source ∩ source image.
+
+A point of the anchor's ray at inverse depth w projects to a + w b in homogeneous source
+pixels. Being in front and inside the image are then linear in w, so the visible part is one
+interval, found exactly by clipping: no segment is dropped because an end leaves the image.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import check_depth_range, check_image_size, check_shapes
+from deltas_geom.homogeneous import safe_divide
+from deltas_geom.poses import relative_pose
+from deltas_geom.projection import pixel_rays
+from deltas_geom.status import Status
+from deltas_geom.views import PosedViews
+
+
+class EpipolarRays(NamedTuple):
+    """Anchor rays seen by the sources: inverse depth w projects to ``origin + w * slope``.
+
+    Attributes:
+        origin: ``(*B, V-1, N, 3)`` homogeneous source pixel of the point at infinity.
+        slope: ``(*B, V-1, 1, 3)`` K t, the homogeneous epipole, pixels times metres.
+        finite: ``(*B, 1, N)`` bool: the keypoint is finite; if not, (0, 0) stands in for it.
+    """
+
+    origin: Tensor
+    slope: Tensor
+    finite: Tensor
+
+    def at(self, inv_depth: Tensor) -> Tensor:
+        """Homogeneous source pixels ``(*B, V-1, N, S, 3)`` at ``(*B, V-1, N, S)`` 1/m."""
+        return self.origin[..., None, :] + inv_depth[..., None] * self.slope[..., None, :]
+
+
+class Segments(NamedTuple):
+    """The visible part of every keypoint's epipolar line in every source.
+
+    Attributes:
+        start: ``(*B, V-1, N, 2)`` pixel of the far end.
+        end: ``(*B, V-1, N, 2)`` pixel of the near end.
+        inv_depth_start: ``(*B, V-1, N)`` inverse of the anchor's z at the far end, 1/m.
+        inv_depth_end: ``(*B, V-1, N)`` the same at the near end.
+        status: ``(*B, V-1, N)`` int8 of :class:`Status`: OK; NO_PARALLAX where the segment
+            is a point; EMPTY where nothing of the range is visible and NOT_FINITE_INPUT where
+            the keypoint is not finite (ends and inverse depths are then 0, with zero gradient).
+        foreshortening: ``(*B, V-1, N)`` homogeneous depth at the near end over that at the
+            far end; it tells how inverse depth runs between the two ends.
+    """
+
+    start: Tensor
+    end: Tensor
+    inv_depth_start: Tensor
+    inv_depth_end: Tensor
+    status: Tensor
+    foreshortening: Tensor
+
+    @property
+    def visible(self) -> Tensor:
+        """``(*B, V-1, N)`` bool: there is something to sample."""
+        return (self.status == Status.OK) | (self.status == Status.NO_PARALLAX)
+
+
+def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
+    """How the anchor's pixels move through the sources with inverse depth.
+
+    Args:
+        views: the anchor (view 0) and its V-1 sources.
+        pixels: ``(*B, N, 2)`` keypoints of the anchor.
+    """
+    check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "N 2"))
+    source_from_anchor = relative_pose(
+        views.cam_from_world[..., 1:, :, :], views.cam_from_world[..., :1, :, :]
+    )
+    K_source = views.K[..., 1:, :, :]
+    finite = pixels.isfinite().all(dim=-1)
+    # A NaN would reach the gradient of every camera through the products below.
+    known = torch.where(finite[..., None], pixels, 0.0)
+    rays = pixel_rays(views.K[..., 0, :, :], known).unsqueeze(-3)
+    origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
+    slope = (K_source @ source_from_anchor[..., :3, 3:]).mT
+    return EpipolarRays(origin, slope, finite.unsqueeze(-2))
+
+
+def epipolar_segments(
+    views: PosedViews,
+    pixels: Tensor,
+    *,
+    depth_range: tuple[float, float],
+    image_size: tuple[int, int],
+) -> Segments:
+    """Segments of the sources on which the anchor's keypoints can be matched.
+
+    Args:
+        views: the anchor (view 0) and its V-1 sources.
+        pixels: ``(*B, N, 2)`` keypoints of the anchor.
+        depth_range: (near, far) along the anchor's z axis, metres; far may be ``inf``.
+        image_size: (height, width) of the sources.
+
+    Returns:
+        Segments that are exactly the visible part: every depth of the range that is visible
+        lies on them, none outside.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+        ValueError: the depth range or the image size makes no sense.
+
+    Source: the paper, section 3.2 and figure 3; clipping as in Liang and Barsky (1984).
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]).expand(2, 3, 3)
+        >>> pose = torch.eye(4).repeat(2, 1, 1)
+        >>> pose[1, 0, 3] = -0.2
+        >>> segments = epipolar_segments(
+        ...     PosedViews(K, pose), torch.tensor([[60.0, 40.0]]),
+        ...     depth_range=(0.5, 10.0), image_size=(80, 100))
+        >>> segments.start[0, 0], segments.end[0, 0]
+        (tensor([58., 40.]), tensor([20., 40.]))
+    """
+    check_depth_range(depth_range)
+    check_image_size(image_size)
+    rays = epipolar_rays(views, pixels)
+    near, far = depth_range
+    height, width = image_size
+    origin, slope = rays.origin, rays.slope.expand_as(rays.origin)
+    # Each row asks origin·row + w slope·row >= 0: in front, left, right, top, bottom.
+    rows = origin.new_tensor(
+        [[0, 0, 1], [1, 0, 0.5], [-1, 0, width - 0.5], [0, 1, 0.5], [0, -1, height - 0.5]]
+    )
+    constant, growth = origin @ rows.mT, slope @ rows.mT
+    # In front by more than rounding, so that the division by depth below is safe.
+    margin = 64 * torch.finfo(origin.dtype).eps * (origin.abs() + slope.abs() / near).amax(-1)
+    constant = torch.cat([constant[..., :1] - margin[..., None], constant[..., 1:]], dim=-1)
+
+    moving = growth != 0
+    crossing = safe_divide(-constant, growth, moving)
+    infinity = float("inf")
+    low = torch.where(moving & (growth > 0), crossing, -infinity).amax(dim=-1)
+    high = torch.where(moving & (growth < 0), crossing, infinity).amin(dim=-1)
+    low, high = low.clamp(min=1 / far), high.clamp(max=1 / near)
+    always_out = (~moving & (constant < 0)).any(dim=-1)
+    visible = (low <= high) & ~always_out & rays.finite
+
+    low, high = torch.where(visible, low, 0.0), torch.where(visible, high, 0.0)
+    ends = rays.at(torch.stack([low, high], dim=-1))
+    end_pixels = safe_divide(ends[..., :2], ends[..., 2:], visible[..., None, None])
+    start, end = end_pixels.unbind(dim=-2)
+    length = (end - start).abs().amax(dim=-1)
+    a_point = length <= 16 * torch.finfo(length.dtype).eps * max(height, width)
+    status = torch.where(a_point, Status.NO_PARALLAX, Status.OK)
+    status = torch.where(visible, status, Status.EMPTY)
+    status = torch.where(rays.finite, status, Status.NOT_FINITE_INPUT).to(torch.int8)
+    foreshortening = torch.where(
+        visible, safe_divide(ends[..., 1, 2], ends[..., 0, 2], visible), 1.0
+    )
+    return Segments(start, end, low, high, status, foreshortening)

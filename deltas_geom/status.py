@@ -1,0 +1,50 @@
+"""Why an item of a batch has no answer: failure is data, not an exception."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Outcome of one point or one segment; stored as int8 tensors.
+
+    Example:
+        >>> print(Status.NO_PARALLAX.explanation)
+        the used cameras are in line with the point, so depth cannot be seen: add a view from elsewhere
+    """
+
+    OK = 0
+    TOO_FEW_VIEWS = 1
+    NO_PARALLAX = 2
+    AT_INFINITY = 3
+    BEHIND_CAMERA = 4
+    NOT_FINITE_INPUT = 5
+    EMPTY = 6
+
+    @property
+    def explanation(self) -> str:
+        """One sentence: the cause and, where there is one, the cure."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Status.OK: "the result is valid",
+    Status.TOO_FEW_VIEWS: (
+        "fewer than two views have a true mask and a weight that counts: add matches for this point"
+    ),
+    Status.NO_PARALLAX: (
+        "the used cameras are in line with the point, so depth cannot be seen: add a view from "
+        "elsewhere"
+    ),
+    Status.AT_INFINITY: (
+        "the rays are parallel within rounding: treat the point as a direction, or widen the "
+        "baseline"
+    ),
+    Status.BEHIND_CAMERA: (
+        "the rays meet behind a used camera: a match is wrong, or a pose is inverted"
+    ),
+    Status.NOT_FINITE_INPUT: (
+        "a used pixel, weight or camera is NaN or infinite: mask the view for this point"
+    ),
+    Status.EMPTY: (
+        "no depth of the range is visible in this source: widen the range or choose another view"
+    ),
+}

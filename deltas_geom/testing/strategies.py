@@ -1,0 +1,109 @@
+"""Hypothesis strategies that draw geometry, so that a failure shrinks to a scene.
+
+Everything drawn is well posed by construction: no test needs to filter. Tensors are float64
+on the CPU; cast them in the test.
+"""
+
+import torch
+from torch import Tensor
+
+try:
+    from hypothesis import strategies as st
+except ImportError as error:  # pragma: no cover
+    raise ImportError(
+        "deltas_geom.testing.strategies needs hypothesis: pip install 'deltas[test]'"
+    ) from error
+
+from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene, rigid, scene_from
+from deltas_geom.views import PosedViews
+
+
+@st.composite
+def vectors(draw: st.DrawFn, count: int, *, within: float, size: int = 3) -> Tensor:
+    """``(count, size)`` numbers between ``-within`` and ``within``.
+
+    Args:
+        draw: given by hypothesis.
+        count: how many vectors.
+        within: bound of each coordinate, in the caller's unit.
+        size: coordinates of a vector.
+    """
+    # Multiples of a 1/1024 of the bound shrink to short numbers and never underflow.
+    steps = st.integers(-1024, 1024)
+    drawn = draw(st.lists(steps, min_size=count * size, max_size=count * size))
+    return torch.tensor(drawn, dtype=torch.float64).reshape(count, size) * (within / 1024)
+
+
+@st.composite
+def scales(draw: st.DrawFn, *, decades: float = 3.0) -> float:
+    """A positive factor between 10^-decades and 10^decades, evenly over the logarithm."""
+    return float(10.0 ** draw(st.floats(-decades, decades)))
+
+
+@st.composite
+def intrinsics(draw: st.DrawFn, num_views: int = 1) -> Tensor:
+    """``(V, 3, 3)`` cameras of 640 x 480 pixels: focal lengths 400 to 600 px, some skew."""
+    height, width = IMAGE_SIZE
+    change = draw(vectors(num_views, within=1.0, size=5))
+    K = torch.zeros(num_views, 3, 3, dtype=torch.float64)
+    K[:, 0, 0] = 500 + 100 * change[:, 0]
+    K[:, 1, 1] = 500 + 100 * change[:, 1]
+    K[:, 0, 2] = width / 2 + 40 * change[:, 2]
+    K[:, 1, 2] = height / 2 + 40 * change[:, 3]
+    K[:, 0, 1] = 5 * change[:, 4]
+    K[:, 2, 2] = 1
+    return K
+
+
+@st.composite
+def poses(draw: st.DrawFn, num_views: int = 1, *, turn: float = 0.2, shift: float = 0.04) -> Tensor:
+    """``(V, 4, 4)`` rigid transforms near the identity.
+
+    Args:
+        draw: given by hypothesis.
+        num_views: V.
+        turn: bound of each component of axis times angle, rad.
+        shift: bound of each coordinate of the translation, metres.
+    """
+    return rigid(draw(vectors(num_views, within=turn)), draw(vectors(num_views, within=shift)))
+
+
+@st.composite
+def cameras(draw: st.DrawFn, num_views: int = 2) -> PosedViews:
+    """V cameras side by side, looking roughly ahead; neighbours 9 cm or more apart."""
+    pose = draw(poses(num_views))
+    # The shift is of the centre, along the world's x axis, whatever the camera's turn.
+    right = torch.zeros(num_views, 3, 1, dtype=torch.float64)
+    right[:, 0, 0] = 0.2 * torch.arange(num_views)
+    pose[:, :3, 3:] = -pose[:, :3, :3] @ (right + pose[:, :3, 3:])
+    return PosedViews(draw(intrinsics(num_views)), pose)
+
+
+@st.composite
+def posed_scenes(draw: st.DrawFn, num_views: int = 2, num_points: int = 4) -> PosedScene:
+    """Views 9 cm or more apart, every point 1.8 m or more ahead of each."""
+    views = draw(cameras(num_views))
+    ahead = torch.tensor([0.0, 0.0, 3.5], dtype=torch.float64)
+    return scene_from(views, draw(vectors(num_points, within=1.0)) + ahead)
+
+
+@st.composite
+def image_pixels(
+    draw: st.DrawFn, count: int, *, image_size: tuple[int, int] = IMAGE_SIZE
+) -> Tensor:
+    """``(count, 2)`` pixels anywhere in an image, its edges included."""
+    height, width = image_size
+    size = torch.tensor([width, height], dtype=torch.float64)
+    return (draw(vectors(count, within=0.5, size=2)) + 0.5) * size - 0.5
+
+
+@st.composite
+def extreme(draw: st.DrawFn, *shape: int, decades: float = 30.0) -> Tensor:
+    """Finite numbers of any sign and of magnitude 10^-decades to 10^decades, and zero."""
+    count = 1
+    for size in shape:
+        count *= size
+    magnitude = st.floats(-decades, decades).map(lambda exponent: 10.0**exponent)
+    number = st.one_of(st.just(0.0), magnitude, magnitude.map(lambda value: -value))
+    drawn = draw(st.lists(number, min_size=count, max_size=count))
+    return torch.tensor(drawn, dtype=torch.float64).reshape(shape)

@@ -1,0 +1,280 @@
+"""Weighted, masked n-view DLT triangulation; every point carries a Status.
+
+Each point is solved in its own rig frame: origin at the w^2-weighted mean of the centres of
+the cameras that see it, unit their spread. There the algebraic error is nearly the angular
+one, the answer does not depend on the world's origin or unit, and a masked view leaves no
+trace. Sums and solve run in float64 whatever the input, where the device has it.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.null_vector import Symmetric4, multiply, null_vector
+from deltas_geom.status import Status
+from deltas_geom.uncertainty import (
+    point_covariance,
+    projection_centers,
+    ray_parallax,
+    reprojection_residual,
+    solver_dtype,
+)
+
+# A view whose weight is below this share of the point's largest counts as no view: its squared
+# weight, times a small parallax, would be lost in the rounding of the normal matrix.
+_NEGLIGIBLE_WEIGHT = 1e-6
+_UPPER = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
+
+
+class Triangulation(NamedTuple):
+    """Triangulated points and what is known about them.
+
+    Attributes:
+        points: ``(*B, N, 3)`` in the world, metres; (0, 0, 0) with zero gradient if not valid.
+        depth: ``(*B, V, N)`` along each camera's z axis, metres; 0 if not valid.
+        status: ``(*B, N)`` int8 of :class:`Status`.
+        valid: ``(*B, N)`` bool, status is OK.
+        residual: ``(*B, N)`` weighted RMS distance of the projections from the pixels, px.
+        parallax: ``(*B, N)`` largest angle between rays of used views, rad.
+        covariance: ``(*B, N, 3, 3)`` for pixel noise of standard deviation 1 / weight px, m^2;
+            None unless asked for.
+    """
+
+    points: Tensor
+    depth: Tensor
+    status: Tensor
+    valid: Tensor
+    residual: Tensor
+    parallax: Tensor
+    covariance: Tensor | None
+
+
+def triangulate_points(
+    proj: Tensor,
+    pixels: Tensor,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    *,
+    frame: Literal["rig", "world"] = "rig",
+) -> Tensor:
+    """Points ``(*B, N, 3)`` alone; see :func:`triangulate`."""
+    return _solve(proj, pixels, weights, mask, frame)[0]
+
+
+def triangulate(
+    proj: Tensor,
+    pixels: Tensor,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    *,
+    frame: Literal["rig", "world"] = "rig",
+    covariance: bool = False,
+) -> Triangulation:
+    """Triangulate matched pixels of V views by weighted DLT, differentiably.
+
+    Args:
+        proj: ``(*B, V, 3, 4)`` K [R | t].
+        pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything.
+        weights: ``(*B, V, N)`` not negative; they multiply the DLT rows. 0 = unused.
+        mask: ``(*B, V, N)`` bool, True = used.
+        frame: "rig" solves in each point's rig frame; "world" in the frame of ``proj``, as
+            OpenCV and kornia do, whose answer depends on the world's origin and unit.
+        covariance: also compute the covariance of the points.
+
+    Returns:
+        Points with status. Nothing raises or turns NaN because of values.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Source: Hartley and Zisserman, 2nd ed., section 12.2; weights as in the paper, section
+    3.2, after Iskakov et al. (2019).
+
+    Example:
+        >>> left = torch.tensor([[100.0, 0, 50, 0], [0, 100, 40, 0], [0, 0, 1, 0]])
+        >>> right = left.clone()
+        >>> right[0, 3] = -20.0  # 20 cm to the right
+        >>> pixels = torch.tensor([[[60.0, 40.0]], [[50.0, 40.0]]])
+        >>> result = triangulate(torch.stack([left, right]), pixels)
+        >>> result.points.round(decimals=3)
+        tensor([[0.2000, 0.0000, 2.0000]])
+    """
+    points, status, used_weights, proj = _solve(proj, pixels, weights, mask, frame)
+    valid = status == Status.OK
+    homogeneous = to_homogeneous(points).unsqueeze(-3) @ proj.mT
+    depth = torch.where(valid.unsqueeze(-2), homogeneous[..., 2], 0.0)
+    used_weights = torch.where(valid.unsqueeze(-2), used_weights, 0.0)
+    safe_pixels = torch.where(used_weights[..., None] > 0, pixels, 0.0)
+    return Triangulation(
+        points=points,
+        depth=depth,
+        status=status,
+        valid=valid,
+        residual=reprojection_residual(proj, points, safe_pixels, used_weights),
+        parallax=ray_parallax(proj, points, used_weights > 0),
+        covariance=point_covariance(proj, points, used_weights) if covariance else None,
+    )
+
+
+def _solve(
+    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None, frame: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points ``(*B, N, 3)``, status ``(*B, N)``, effective weights ``(*B, V, N)``, finite proj."""
+    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
+    if frame not in ("rig", "world"):
+        raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+    weight = torch.ones_like(pixels[..., 0])
+    if weights is not None:
+        check_shapes(weights=(weights, "V N"), pixels=(pixels, "V N 2"))
+        weight = weight * weights
+    if mask is not None:
+        check_shapes(mask=(mask, "V N"), pixels=(pixels, "V N 2"))
+        weight = torch.where(mask, weight, 0.0)
+    batch = batch_shape(proj.shape[:-3], weight.shape[:-2])
+    weight = weight.expand(*batch, *weight.shape[-2:])
+    pixels = pixels.expand(*weight.shape, 2)
+
+    used = weight != 0  # NaN counts as used, and is caught as not finite
+    finite_proj = proj.isfinite().all(-1).all(-1)[..., None]
+    finite = ((pixels.isfinite().all(dim=-1) & weight.isfinite() & finite_proj) | ~used).all(-2)
+    # Double where throughout: what is not used must pass no gradient and no NaN.
+    largest = torch.where(used, weight.detach().abs(), 0.0).amax(dim=-2, keepdim=True)
+    counts = used & (weight.detach().abs() > _NEGLIGIBLE_WEIGHT * largest)
+    enough = counts.sum(dim=-2) >= 2
+    solvable = (finite & enough).unsqueeze(-2) & used
+
+    proj = torch.where(finite_proj[..., None], proj, 0.0)
+    eps = torch.finfo(proj.dtype).eps
+    work = solver_dtype(proj)
+    wide_proj = proj.to(work)
+    xy = torch.where(solvable[..., None], pixels, 0.0).to(work)
+    # The scale of all weights cancels; without it their squares cannot underflow.
+    share = torch.where(solvable, weight, 0.0).to(work) / torch.where(largest > 0, largest, 1.0)
+    squared = share.square()
+
+    centers, _ = projection_centers(wide_proj)
+    origin, unit = _shared_frame(centers.detach(), solvable.any(dim=-1))
+    moved = wide_proj[..., 3:] + wide_proj[..., :3] @ origin.unsqueeze(-2).mT
+    shared = torch.cat([wide_proj[..., :3], moved / unit[..., None, None]], dim=-1)
+    normal = _normal_matrix(shared, xy, squared)
+    shared_centers = (centers - origin) / unit[..., None]
+    point_origin, point_unit = _point_frame(shared_centers, squared)
+    if frame == "rig":
+        normal = _change_frame(normal, point_origin, point_unit)
+    else:
+        normal = _change_frame(normal, -origin / unit, (1 / unit)[..., 0, None])
+
+    # Centres closer together than the rounding of where they are do not differ.
+    reach = (shared_centers.detach().unsqueeze(-2) - point_origin.detach().unsqueeze(-3)).norm(
+        dim=-1
+    )
+    baseline = torch.where(counts, reach, 0.0).amax(dim=-2) * unit
+    from_world = torch.where(counts, centers.detach().norm(dim=-1)[..., None], 0.0).amax(dim=-2)
+    posed = finite & enough & (baseline > 64 * eps * from_world)
+    matrix, solvable_matrix = _made_safe(normal, posed)
+    (x0, x1, x2, x3), simple = null_vector(matrix)
+    posed = posed & solvable_matrix & simple
+
+    # Far above the smallest number, so that the gradient of the division is finite.
+    divisible = x3 > torch.finfo(work).tiny ** (1 / 3)
+    local = safe_divide(
+        torch.stack([x0, x1, x2], dim=-1), x3[..., None], (posed & divisible)[..., None]
+    )
+    if frame == "rig":
+        local = (local * point_unit[..., None] + point_origin) * unit[..., None] + origin
+    rig_center = point_origin.detach() * unit[..., None] + origin
+    distance = (local.detach() - rig_center).norm(dim=-1)
+    at_infinity = ~divisible | (16 * eps * distance > baseline)
+    local = torch.where((posed & ~at_infinity)[..., None], local, 0.0)
+
+    # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
+    depth = (to_homogeneous(local.detach()).unsqueeze(-3) @ wide_proj.detach().mT)[..., 2]
+    in_front = ((depth > 0) | ~solvable).all(dim=-2)
+    size = torch.maximum(local.detach().abs().amax(dim=-1), depth.abs().amax(dim=-2))
+    representable = size < torch.finfo(proj.dtype).max
+    ok = posed & ~at_infinity & in_front & representable
+    points = torch.where(ok[..., None], local, 0.0).to(proj.dtype)
+
+    status = torch.full_like(enough, Status.OK, dtype=torch.int8)
+    for failed, reason in (
+        (~in_front, Status.BEHIND_CAMERA),
+        (at_infinity | ~representable, Status.AT_INFINITY),
+        (~posed, Status.NO_PARALLAX),
+        (~enough, Status.TOO_FEW_VIEWS),
+        (~finite, Status.NOT_FINITE_INPUT),
+    ):
+        status = torch.where(failed, torch.full_like(status, reason), status)
+    return points, status, torch.where(solvable, weight, 0.0), proj
+
+
+def _shared_frame(centers: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean ``(*B, 1, 3)`` and spread ``(*B, 1)`` of the centres of views used by any point."""
+    count = used.sum(dim=-1, keepdim=True).clamp(min=1)
+    origin = torch.where(used[..., None], centers, 0.0).sum(dim=-2) / count
+    squared = (centers - origin.unsqueeze(-2)).square().sum(dim=-1)
+    spread = (torch.where(used, squared, 0.0).sum(dim=-1, keepdim=True) / count).sqrt()
+    return origin.unsqueeze(-2), torch.where(spread > 0, spread, 1.0)
+
+
+def _normal_matrix(proj: Tensor, xy: Tensor, squared: Tensor) -> Symmetric4:
+    """A^T W^2 A of the DLT rows x p3 - p1, y p3 - p2, as ten ``(*B, N)``.
+
+    Every entry is linear in (x^2 + y^2, x, y, 1), so all points cost one matrix product.
+    """
+    p1, p2, p3 = proj.unbind(dim=-2)
+    rows, columns = _UPPER
+
+    def outer(a: Tensor, b: Tensor) -> Tensor:
+        return (a[..., rows] * b[..., columns] + b[..., rows] * a[..., columns]) / 2
+
+    coefficients = torch.stack(
+        [outer(p3, p3), -2 * outer(p3, p1), -2 * outer(p3, p2), outer(p1, p1) + outer(p2, p2)],
+        dim=-1,
+    )  # (*B, V, 10, 4)
+    x, y = xy.unbind(dim=-1)
+    terms = torch.stack([(x * x + y * y) * squared, x * squared, y * squared, squared], dim=-2)
+    entries = (coefficients @ terms).sum(dim=-3)
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries.unbind(dim=-2)
+    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+
+
+def _point_frame(centers: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean ``(*B, N, 3)`` of the centres and, as the unit, their spread ``(*B, N)``."""
+    total = squared.sum(dim=-2)
+    share = safe_divide(squared, total.unsqueeze(-2), (total > 0).unsqueeze(-2))
+    origin = share.mT @ centers
+    offsets = centers.unsqueeze(-2) - origin.unsqueeze(-3)
+    variance = (share * offsets.square().sum(dim=-1)).sum(dim=-2)
+    return origin, torch.where(variance > torch.finfo(variance.dtype).tiny, variance, 1.0).sqrt()
+
+
+def _change_frame(normal: Symmetric4, origin: Tensor, unit: Tensor) -> Symmetric4:
+    """T^T M T for points x = unit x' + origin."""
+    m00, m01, m02, _, m11, m12, _, m22, _, _ = normal
+    o0, o1, o2 = (component.expand_as(m00) for component in origin.unbind(dim=-1))
+    one = torch.ones_like(o0)
+    n03, n13, n23, n33 = multiply(normal, (o0, o1, o2, one))
+    last = o0 * n03 + o1 * n13 + o2 * n23 + n33
+    u, u2 = unit, unit * unit
+    return (
+        m00 * u2, m01 * u2, m02 * u2, n03 * u,
+        m11 * u2, m12 * u2, n13 * u,
+        m22 * u2, n23 * u,
+        last,
+    )  # fmt: skip
+
+
+def _made_safe(normal: Symmetric4, posed: Tensor) -> tuple[Symmetric4, Tensor]:
+    """Scaled to trace 1, and whether it can be; if not, a constant with an easy null vector."""
+    trace = (normal[0] + normal[4] + normal[7] + normal[9]).detach()
+    usable = posed & (trace > 0) & trace.isfinite()
+    scale = torch.where(usable, trace, 1.0)
+    easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.1)
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
+        torch.where(usable, entry / scale, constant)
+        for entry, constant in zip(normal, easy, strict=True)
+    )
+    return (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), usable

@@ -1,0 +1,1 @@
+"""Metric depth from posed images: the DELTAS network, its training, weights and command."""

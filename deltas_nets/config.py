@@ -1,0 +1,188 @@
+"""What a network, its losses and a training are made of: frozen dataclasses.
+
+One dataclass is the flags of the command line, the argument in a notebook and the record that
+is written beside the weights.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar, get_type_hints
+
+Config = TypeVar("Config")
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """Interest points: some detected, the others spread evenly over the image."""
+
+    num_keypoints: int = 512
+    """Points per image."""
+    detected_share: float = 0.5
+    """At most this share comes from the detector (the paper: 0.5)."""
+    threshold: float = 5e-4
+    """Weakest detection that is kept, as a probability (the paper: 5e-4)."""
+    nms_radius: int = 4
+    """Detections are at least this far apart, pixels (the paper: 9 at 240 x 320)."""
+    border: int = 2
+    """Nothing is detected nearer to the image border, pixels."""
+
+    def __post_init__(self) -> None:
+        if self.num_keypoints < 8:
+            raise ValueError(f"num_keypoints must be at least 8, got {self.num_keypoints}")
+        if not 0 <= self.detected_share <= 1:
+            raise ValueError(f"detected_share must be within [0, 1], got {self.detected_share}")
+
+
+@dataclass(frozen=True)
+class MatcherConfig:
+    """How keypoints find their depth in the sources."""
+
+    kind: Literal["joint", "per_view"] = "joint"
+    """joint fuses all views at common inverse depths; per_view decides in each, as the paper."""
+    num_samples: int = 64
+    """Samples along a segment (the paper: 100)."""
+    offsets: tuple[float, ...] = (-1.0, 0.0, 1.0)
+    """per_view: parallel lines searched besides the epipolar line, pixels."""
+    context_rounds: int = 2
+    """joint: rounds in which points exchange evidence before they decide; 0 is none."""
+    context_heads: int = 4
+    """joint: attention heads in each round."""
+    window: int = 2
+    """joint: soft-argmax looks this many samples to either side of the peak."""
+    refine_radius: float = 3.0
+    """joint: the 2D match may move this far along the epipolar line, pixels."""
+
+    def __post_init__(self) -> None:
+        if self.num_samples < 8:
+            raise ValueError(f"num_samples must be at least 8, got {self.num_samples}")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """A network; the defaults are `deltas-small`."""
+
+    name: str = "deltas-small"
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    descriptor_dim: int = 48
+    """Channels of the descriptors, which are at half the image's resolution."""
+    densifier_widths: tuple[int, int, int, int] = (32, 48, 64, 96)
+    """Channels of the densifier at 1/2, 1/4, 1/8, 1/16."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss terms; the first five are the paper's terms."""
+
+    detector: float = 0.1
+    """Cross-entropy of interest points."""
+    match: float = 0.1
+    """Smooth L1 of 2D matches, pixels."""
+    point: float = 2.0
+    """Smooth L1 of 3D points, relative to their depth."""
+    smoothness: float = 0.02
+    """Edge-aware smoothness of the dense map."""
+    depth: float = 2.0
+    """Smooth L1 of log depth at the finest of four scales."""
+    scale_decay: float = 0.7
+    """Factor of the depth term from a scale to the next coarser one (the paper: 0.7)."""
+    gradient: float = 2.0
+    """L1 of the gradient of log depth at the two finest scales: keeps edges where they are."""
+    posterior: float = 1.0
+    """Cross-entropy of the posterior over inverse depth, at every stage."""
+    confidence: float = 0.5
+    """Cross-entropy of the points' confidence."""
+    spread: float = 0.2
+    """Laplace likelihood of the dense map's own uncertainty."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Procedural rooms to train on."""
+
+    num_rooms: int = 4000
+    seed: int = 1000
+    """Seed of the first room; validation rooms have seeds below 1000."""
+    num_views: int = 5
+    """Views rendered per room; any of them can be the anchor."""
+    height: int = 192
+    width: int = 256
+    """Size of the rendered images, pixels."""
+    cache: str | None = None
+    """Folder that keeps rendered rooms; rendering is repeated every epoch without it."""
+    workers: int = 1
+    """Processes that read or render ahead; 0 does it in the training process."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything a training run depends on."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    steps: int = 5000
+    """Optimiser steps of the whole schedule."""
+    sizes: tuple[tuple[int, int], ...] = ((144, 192), (144, 192), (192, 256))
+    """(height, width) of the images of a step, drawn at random."""
+    batch_size: int = 6
+    learning_rate: float = 2e-3
+    """Peak of the one-cycle schedule; the pretrained encoder gets a fifth of it."""
+    weight_decay: float = 1e-4
+    warmup: int = 100
+    """Steps until the peak."""
+    min_views: int = 2
+    max_views: int = 5
+    """Views per step, the anchor included, drawn at random."""
+    num_keypoints: int = 320
+    """Points per image in training."""
+    pose_noise: tuple[float, float] = (0.004, 0.0015)
+    """Standard deviation of the sources' pose errors: metres, radians."""
+    clip_gradient: float = 5.0
+    average: float = 0.995
+    """Decay of the running average of the weights, which is what is evaluated and shipped."""
+    seed: int = 0
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.min_views <= self.max_views <= self.data.num_views:
+            raise ValueError(
+                f"views must satisfy 2 <= min_views <= max_views <= data.num_views, got "
+                f"{self.min_views}, {self.max_views}, {self.data.num_views}"
+            )
+        if self.steps < 1 or self.batch_size < 1:
+            raise ValueError("steps and batch_size must be at least 1")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A config dataclass as plain, JSON-ready values."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
+    """The config that :func:`to_dict` recorded.
+
+    Args:
+        kind: the dataclass, for example :class:`NetworkConfig`.
+        values: its fields; missing ones keep their defaults.
+
+    Raises:
+        ValueError: a field is unknown: the record is of another version.
+    """
+    hints = get_type_hints(kind)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise ValueError(f"{kind.__name__} has no field {', '.join(unknown)}")
+    read: dict[str, Any] = {}
+    for name, value in values.items():
+        hint = hints[name]
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            value = from_dict(hint, value)
+        elif isinstance(value, list):
+            value = tuple(value)
+        read[name] = value
+    return kind(**read)
+
+
+CONFIGS: dict[str, NetworkConfig] = {"deltas-small": NetworkConfig()}
+"""Networks by name."""

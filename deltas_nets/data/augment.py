@@ -1,0 +1,108 @@
+"""From rooms as rendered to what a training step sees."""
+
+import torch
+import torch.nn.functional as F
+from kornia.augmentation import (
+    RandomGamma,
+    RandomGaussianBlur,
+    RandomGaussianNoise,
+    RandomLinearIllumination,
+    RandomRGBShift,
+    RandomSaturation,
+)
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor, nn
+
+from deltas_geom import PosedViews
+from deltas_nets.data.posed_images import PosedImages
+
+
+def choose_views(batch: PosedImages, num_views: int, generator: torch.Generator) -> PosedImages:
+    """A random anchor and sources of every room: ``(B, num_views, ...)``."""
+    count, available = batch.depth.shape[:2]
+    order = torch.rand(count, available, generator=generator).argsort(dim=1)[:, :num_views]
+    row = torch.arange(count)[:, None]
+    views = PosedViews(batch.views.K[row, order], batch.views.cam_from_world[row, order])
+    return PosedImages(batch.images[row, order], views, batch.depth[row, order])
+
+
+def mirror(batch: PosedImages, flips: Tensor) -> PosedImages:
+    """Mirror some rooms left to right, cameras and all.
+
+    Args:
+        batch: ``(B, V, ...)``.
+        flips: ``(B)`` bool.
+    """
+    width = batch.images.shape[-1]
+    K = batch.views.K.clone()
+    K[..., 0, 2] = width - 1 - K[..., 0, 2]
+    reflect = torch.diag(torch.tensor([-1.0, 1, 1, 1], device=K.device))
+    mirrored = PosedImages(
+        batch.images.flip(-1),
+        PosedViews(K, reflect @ batch.views.cam_from_world @ reflect),
+        batch.depth.flip(-1),
+    )
+
+    def pick(flipped: Tensor, straight: Tensor) -> Tensor:
+        return torch.where(flips.view(-1, *[1] * (straight.ndim - 1)), flipped, straight)
+
+    return PosedImages(
+        pick(mirrored.images, batch.images),
+        PosedViews(*(pick(*pair) for pair in zip(mirrored.views, batch.views, strict=True))),
+        pick(mirrored.depth, batch.depth),
+    )
+
+
+def resize(batch: PosedImages, size: tuple[int, int]) -> PosedImages:
+    """Shrink images by area, depth by nearest centre, and carry the intrinsics along."""
+    old = (batch.images.shape[-2], batch.images.shape[-1])
+    if old == size:
+        return batch
+    images = F.interpolate(
+        batch.images.flatten(0, 1), size=size, mode="bilinear", antialias=True
+    ).unflatten(0, batch.images.shape[:2])
+    depth = F.interpolate(batch.depth, size=size, mode="nearest-exact")
+    return PosedImages(images, batch.views.resize(old_size=old, new_size=size), depth)
+
+
+class Photometry(nn.Module):
+    """What a camera does to light, differently in every view: kornia's augmentations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.steps = nn.Sequential(
+            RandomGamma(gamma=(0.65, 1.5), gain=(0.75, 1.25), p=1.0),
+            RandomRGBShift(0.07, 0.05, 0.07, p=0.7),
+            RandomSaturation((0.3, 1.3), p=0.5),
+            RandomLinearIllumination(gain=(0.01, 0.25), p=0.3),
+            RandomGaussianBlur((5, 5), (0.3, 1.2), p=0.3),
+            RandomGaussianNoise(0.0, 0.015, p=0.7),
+        )
+
+    def forward(self, images: Tensor, seed: int) -> Tensor:
+        """Augment ``(B, V, 3, H, W)`` in [0, 1]; the same seed does the same."""
+        # kornia draws from torch's global generator; it is put back afterwards.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            changed: Tensor = self.steps(images.flatten(0, 1))
+        return changed.clamp(0, 1).unflatten(0, images.shape[:2])
+
+
+def disturb_poses(
+    views: PosedViews, noise: tuple[float, float], generator: torch.Generator
+) -> PosedViews:
+    """Tracking errors of the sources, as real poses have them.
+
+    Args:
+        views: ``(B, V)``.
+        noise: standard deviations of translation (metres) and rotation (radians), per axis.
+        generator: source of randomness.
+    """
+    batch, count = views.K.shape[:2]
+    shift = noise[0] * torch.randn(batch, count, 3, generator=generator)
+    turn = noise[1] * torch.randn(batch * count, 3, generator=generator)
+    error = torch.eye(4).repeat(batch, count, 1, 1)
+    error[..., :3, :3] = axis_angle_to_rotation_matrix(turn).unflatten(0, (batch, count))
+    error[..., :3, 3] = shift
+    error[:, 0] = torch.eye(4)  # the anchor defines the frame
+    return views._replace(cam_from_world=error.to(views.K.device) @ views.cam_from_world)

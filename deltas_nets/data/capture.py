@@ -1,0 +1,179 @@
+"""A capture: posed frames of one scene, whatever the folder they came from looks like."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from deltas_nets.errors import UserError
+
+__all__ = ["Capture", "FloatArray", "Frame", "ids_in_words", "image_size_of", "open_capture"]
+
+FloatArray = NDArray[np.float64]
+
+UNKNOWN_DEPTH = 65535
+"""7-Scenes and some headsets write this for "no depth", beside 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image, the camera that took it, and the depth a sensor measured, if any."""
+
+    id: int
+    image_path: Path
+    image_size: tuple[int, int]
+    """(height, width) of the image file."""
+    K: FloatArray
+    """(3, 3) intrinsics for the image at its own size, pixel centres at integers."""
+    cam_from_world: FloatArray
+    """(4, 4) rigid, OpenCV axes, metres."""
+    depth_path: Path | None = None
+    depth_K: FloatArray | None = None
+    """(3, 3) intrinsics of the depth image; None where it sees what the colour image sees."""
+
+    def read_image(self) -> NDArray[np.uint8]:
+        """Decode the whole image.
+
+        Returns:
+            ``(H, W, 3)`` RGB of ``image_size``.
+
+        Raises:
+            UserError: the file is missing, damaged, truncated, not 8-bit, or of another size.
+        """
+        remedy = "copy the file again, or take the frame out of the view sets"
+        image = _decode(self.image_path, remedy=remedy)
+        if image.mode.startswith(("I", "F")):
+            # Pillow would clip these to white without a word.
+            what = f"image has pixels of type {image.mode}, not 8-bit colour"
+            raise UserError(what, self.image_path, "convert it to an 8-bit JPEG or PNG")
+        if (image.height, image.width) != self.image_size:
+            height, width = self.image_size
+            what = f"image is {image.width}x{image.height}, the intrinsics are for {width}x{height}"
+            raise UserError(what, self.image_path, "export all images of a capture at one size")
+        return np.asarray(image.convert("RGB"))
+
+    def read_depth(self) -> NDArray[np.float32]:
+        """Decode the sensor depth.
+
+        Returns:
+            ``(H, W)`` metres at the depth image's own size, 0 where unknown.
+
+        Raises:
+            UserError: the frame has none, or the file is damaged or not a 16-bit image.
+        """
+        if self.depth_path is None:
+            remedy = "add depth/N.png to the capture or run without sensor depth"
+            raise UserError(f"frame {self.id} has no sensor depth", self.image_path, remedy)
+        image = _decode(self.depth_path, remedy="copy the file again")
+        if not image.mode.startswith("I"):
+            what = f"depth has pixels of type {image.mode}, not 16-bit millimetres"
+            raise UserError(what, self.depth_path, "export depth as a 16-bit grey PNG")
+        millimetres = np.asarray(image).astype(np.int64)
+        unknown = (millimetres <= 0) | (millimetres >= UNKNOWN_DEPTH)
+        return np.where(unknown, 0.0, millimetres / 1000.0).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """The frames of one folder."""
+
+    path: Path
+    """The folder that holds the images' folder: the scene, where captures are nested."""
+    frames: Mapping[int, Frame]
+    """Frames with a usable pose, in the order of their ids."""
+    lost: Mapping[int, str]
+    """Frames left out because of their pose, with the reason."""
+
+    def frame(self, id: int) -> Frame:
+        """The frame called ``id``.
+
+        Raises:
+            UserError: there is none, or its pose was lost; names the nearest ids.
+        """
+        if id in self.frames:
+            return self.frames[id]
+        nearest = sorted(sorted(self.frames, key=lambda other: (abs(other - id), other))[:4])
+        remedy = f"use a frame it has; the nearest are {ids_in_words(nearest)}"
+        if id in self.lost:
+            raise UserError(f"frame {id} has no usable pose ({self.lost[id]})", self.path, remedy)
+        raise UserError(f"the capture has no frame {id}", self.path, remedy)
+
+
+def open_capture(path: str | Path) -> Capture:
+    """Read poses, intrinsics and sizes of a capture; no pixels are decoded.
+
+    Args:
+        path: a folder in ScanNet's export layout, or a folder with one such scene inside.
+
+    Returns:
+        A capture with at least one frame.
+
+    Raises:
+        UserError: the folder or a file in it is missing or malformed; the text names it.
+    """
+    # Here, because readers build frames and therefore import this file.
+    from deltas_nets.data.readers import scannet
+
+    # A further format is a file in readers/ and a line here.
+    readers: tuple[tuple[Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
+        (scannet.recognises, scannet.read),
+    )
+
+    path = Path(path)
+    if not path.exists():
+        raise UserError("the capture does not exist", path, "check the path")
+    if not path.is_dir():
+        raise UserError("the capture is not a folder", path, "name the folder that holds color/")
+    try:
+        for recognises, read in readers:
+            if recognises(path):
+                return read(path)
+        _explain_unknown(path)
+    except OSError as error:
+        what = f"the capture cannot be read ({error.strerror or error})"
+        raise UserError(what, Path(error.filename or path), "check its permissions") from error
+
+
+def _explain_unknown(path: Path) -> NoReturn:
+    """Say what a capture should look like to someone whose folder has no layout we know."""
+    remedy = "a capture has folders color, pose and intrinsic (ScanNet's export layout)"
+    raise UserError("there is no folder color with images, as every capture has", path, remedy)
+
+
+def image_size_of(path: Path) -> tuple[int, int] | None:
+    """(height, width) from the header of an image file; None if it is no image."""
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return None
+
+
+def ids_in_words(ids: Iterable[int], limit: int = 5) -> str:
+    """A few ids for an error message.
+
+    Example:
+        >>> ids_in_words(range(9), limit=3)
+        '0, 1, 2 and 6 more'
+    """
+    names = [str(id) for id in ids]
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
+
+
+def _decode(path: Path, *, remedy: str) -> Image.Image:
+    """Decode every pixel, so that a file cut short is found here and not later."""
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except FileNotFoundError as error:
+        raise UserError("the image does not exist", path, remedy) from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        # Pillow's own texts repeat the path and a stream's address; only some help.
+        detail = " (the file is truncated)" if "truncated" in str(error) else ""
+        raise UserError(f"the image cannot be decoded{detail}", path, remedy) from error

@@ -1,0 +1,18 @@
+"""Images, where they were taken from, and how far away what they show is."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from deltas_geom.views import PosedViews
+
+
+class PosedImages(NamedTuple):
+    """Some views of one scene, the item that every data set hands to training."""
+
+    images: Tensor
+    """``(*B, V, 3, H, W)`` RGB, float32 in [0, 1], or uint8 as kept in a cache."""
+    views: PosedViews
+    """Cameras of the images: K ``(*B, V, 3, 3)``, cam_from_world ``(*B, V, 4, 4)``."""
+    depth: Tensor
+    """``(*B, V, H, W)`` metres along z at the pixel centres; 0 where unknown."""

@@ -1,0 +1,239 @@
+"""ScanNet's export layout: color/N.jpg, depth/N.png, pose/N.txt, intrinsic/*.txt."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.data.capture import Capture, FloatArray, Frame, ids_in_words, image_size_of
+from deltas_nets.errors import UserError
+
+__all__ = ["read", "recognises", "world_from_cam_inverse"]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+NESTING = ("scans_test", "scans")
+
+RIGID_TOLERANCE = 2e-3
+"""Largest entry of R^T R - I. Six digits after the point give 1e-5, 7-Scenes as published
+1.5e-4; a scale of 0.1 %, the least that would matter to metric depth, gives 2e-3."""
+
+SPREAD = (0.35, 0.65)
+"""Where a principal point lies, in parts of the image. Cameras are within 0.45 to 0.55; wider,
+because a refusal has no way around it. Images resized by 0.76 or 1.43 are found."""
+
+
+def recognises(path: Path) -> bool:
+    """Whether this folder, or a folder of scenes inside it, is laid out this way."""
+    return _is_scene(path) or any((path / name).is_dir() for name in NESTING)
+
+
+def read(path: Path) -> Capture:
+    """Read one scene; see `deltas_nets.data.capture.open_capture` for the contract."""
+    scene = _find_scene(path)
+    images = _files_by_id(scene / "color", IMAGE_SUFFIXES)
+    poses = _files_by_id(scene / "pose", (".txt",))
+    depths = _files_by_id(scene / "depth", (".png",)) if (scene / "depth").is_dir() else {}
+    if not images:
+        remedy = "put the images there, named by number: 0.jpg, 1.jpg, ..."
+        raise UserError("there are no numbered images", scene / "color", remedy)
+    if not images.keys() & poses.keys():
+        what = f"no pose belongs to an image ({len(poses)} poses, {len(images)} images)"
+        remedy = "name each pose file like its image: pose/7.txt for color/7.jpg"
+        raise UserError(what, scene / "pose", remedy)
+
+    image_size = _common_size(list(images.values()))
+    K = _read_intrinsics(scene / "intrinsic" / "intrinsic_color.txt", image_size)
+    depth_K = None
+    depth_intrinsics = scene / "intrinsic" / "intrinsic_depth.txt"
+    # Registered depth often comes without a file of its own: None says "as the colour image".
+    if depths and depth_intrinsics.exists():
+        depth_K = _read_intrinsics(depth_intrinsics, _common_size(list(depths.values())))
+
+    frames: dict[int, Frame] = {}
+    lost: dict[int, str] = {}
+    for id, image_path in images.items():
+        if id not in poses:
+            lost[id] = "there is no pose file"
+            continue
+        world_from_cam = _read_pose(poses[id])
+        if not np.isfinite(world_from_cam).all():
+            lost[id] = "the pose is not finite"
+            continue
+        cam_from_world = world_from_cam_inverse(world_from_cam, path=poses[id])
+        depth_path = depths.get(id)
+        frames[id] = Frame(
+            id=id,
+            image_path=image_path,
+            image_size=image_size,
+            K=K,
+            cam_from_world=cam_from_world,
+            depth_path=depth_path,
+            depth_K=None if depth_path is None else depth_K,
+        )
+    if not frames:
+        what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(lost)})"
+        raise UserError(what, scene / "pose", "run the tracking again")
+    return Capture(path=scene, frames=frames, lost=lost)
+
+
+def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
+    """The rigid inverse of a finite pose, rounded by printing as it may be.
+
+    Args:
+        world_from_cam: ``(4, 4)``.
+        path: the file it came from, for the error.
+
+    Returns:
+        ``(4, 4)`` whose rotation is orthogonal to float64 precision.
+
+    Raises:
+        UserError: the matrix is not a rotation and a translation.
+    """
+    rotation, centre = world_from_cam[:3, :3], world_from_cam[:3, 3]
+    remedy = "write poses as rigid 4x4 camera-to-world matrices, last row 0 0 0 1"
+    if not np.allclose(world_from_cam[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
+        row = " ".join(f"{value:g}" for value in world_from_cam[3])
+        raise UserError(f"the pose's last row is {row}, not 0 0 0 1", path, remedy)
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not error <= RIGID_TOLERANCE:
+        what = f"the pose is not rigid: its rotation is off orthogonal by {error:.2g}"
+        raise UserError(what, path, remedy)
+    if np.linalg.det(rotation) < 0:
+        raise UserError("the pose mirrors: its rotation has determinant -1", path, remedy)
+    # The nearest rotation, else R^T is not the inverse of R and the rounding of the file stays.
+    left, _, right = np.linalg.svd(rotation)
+    nearest = left @ right
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = nearest.T
+    cam_from_world[:3, 3] = -nearest.T @ centre
+    cam_from_world.setflags(write=False)
+    return cam_from_world
+
+
+def _is_scene(path: Path) -> bool:
+    return any((path / name).is_dir() for name in ("color", "pose", "intrinsic"))
+
+
+def _find_scene(path: Path) -> Path:
+    """The folder that holds color/ and pose/: this one, or the only scene inside."""
+    scene = path
+    if not _is_scene(path):
+        nests = [path / name for name in NESTING if (path / name).is_dir()]
+        scenes = sorted(child for nest in nests for child in nest.iterdir() if _is_scene(child))
+        if not scenes:
+            remedy = "put the folders color, pose and intrinsic into a folder of it"
+            raise UserError("there is no scene inside", nests[0], remedy)
+        if len(scenes) > 1:
+            names = ", ".join(str(scene.relative_to(path)) for scene in scenes[:5])
+            more = f" and {len(scenes) - 5} more" if len(scenes) > 5 else ""
+            what = f"the folder holds {len(scenes)} scenes ({names}{more})"
+            raise UserError(what, path, "name one of them")
+        scene = scenes[0]
+    remedies = {
+        "color": "put the images there: color/0.jpg, color/1.jpg, ...",
+        "pose": "put a 4x4 camera-to-world matrix there for each image: pose/0.txt, ...",
+    }
+    for name, remedy in remedies.items():
+        if not (scene / name).is_dir():
+            raise UserError(f"the capture has no folder {name}", scene, remedy)
+    return scene
+
+
+def _files_by_id(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """Files named by a number, in the order of the numbers; others are not ours to judge."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in suffixes or not (path.stem.isascii() and path.stem.isdigit()):
+            continue
+        id = int(path.stem)
+        if id in found:
+            what = f"two files stand for frame {id} ({found[id].name} and {path.name})"
+            raise UserError(what, folder, "remove one of them")
+        found[id] = path
+    return dict(sorted(found.items()))
+
+
+def _common_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Size of the first readable image: one intrinsic file serves all, so they have one size.
+
+    Only one header is read: 2000 would take seconds on a network drive, and reading an image
+    checks its size against this one. A damaged first file is no obstacle while nobody needs it.
+    """
+    for path in paths:
+        size = image_size_of(path)
+        if size is not None:
+            return size
+    remedy = "copy the files again"
+    raise UserError(f"none of the {len(paths)} images can be decoded", paths[0], remedy)
+
+
+def _read_numbers(path: Path, *, name: str, remedy: str) -> list[float]:
+    """Numbers between spaces; the error shows the first word that is none."""
+    try:
+        words = path.read_text(encoding="utf-8").split()
+    except UnicodeDecodeError as error:
+        raise UserError(f"the {name} file is not text", path, remedy) from error
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError as error:
+            what = f"the {name} file holds {word[:20]!r} where a number should be"
+            raise UserError(what, path, remedy) from error
+    return numbers
+
+
+def _read_pose(path: Path) -> FloatArray:
+    """(4, 4) world_from_cam, not finite where tracking was lost."""
+    remedy = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
+    numbers = _read_numbers(path, name="pose", remedy=remedy)
+    if len(numbers) != 16:
+        raise UserError(f"the pose file has {len(numbers)} numbers, not 16", path, remedy)
+    return np.array(numbers, dtype=np.float64).reshape(4, 4)
+
+
+def _read_intrinsics(path: Path, image_size: tuple[int, int]) -> FloatArray:
+    """(3, 3) K, checked against the size of the images it is for."""
+    remedy = "write the 4x4 or 3x3 matrix fx 0 cx, 0 fy cy, 0 0 1 in pixels"
+    if not path.is_file():
+        raise UserError("the intrinsics are missing", path, remedy)
+    numbers = _read_numbers(path, name="intrinsics", remedy=remedy)
+    if len(numbers) not in (9, 16):
+        what = f"the intrinsics have {len(numbers)} numbers, neither 16 (4x4) nor 9 (3x3)"
+        raise UserError(what, path, remedy)
+    side = 4 if len(numbers) == 16 else 3
+    matrix = np.array(numbers, dtype=np.float64).reshape(side, side)
+    if not np.isfinite(matrix).all():
+        raise UserError("the intrinsics hold numbers that are not finite", path, remedy)
+    K = matrix[:3, :3].copy()
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        what = f"the focal lengths are not positive ({K[0, 0]:g} and {K[1, 1]:g})"
+        raise UserError(what, path, remedy)
+    bottom_is_standard = np.allclose(matrix[-1], np.eye(side)[-1], rtol=0, atol=1e-6)
+    if not bottom_is_standard or not np.allclose(K[2], (0, 0, 1), rtol=0, atol=1e-6) or K[1, 0]:
+        raise UserError("the intrinsics are not a camera matrix", path, remedy)
+    if np.any(matrix[:3, 3:] != 0):
+        raise UserError("the intrinsics have a fourth column that is not 0", path, remedy)
+    _check_resolution(K, image_size, path)
+    K.setflags(write=False)
+    return K
+
+
+def _check_resolution(K: FloatArray, image_size: tuple[int, int], path: Path) -> None:
+    """The principal point is all a file tells about the resolution it was made for.
+
+    Outside the image it cannot belong to it. Inside, but away from the middle by the same part
+    on both axes, it fits an image larger or smaller by one factor; a lens shifted like that is
+    not to be expected, while intrinsics of the full resolution beside small images are.
+    """
+    height, width = image_size
+    across, down = (K[0, 2] + 0.5) / width, (K[1, 2] + 0.5) / height
+    outside = not (0 <= across <= 1 and 0 <= down <= 1)
+    low, high = SPREAD
+    scaled = not low < across < high and not low < down < high and 0.9 < across / down < 1.1
+    if outside or scaled:
+        what = (
+            f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) does not fit images of "
+            f"{width}x{height}: these intrinsics are of another resolution"
+        )
+        raise UserError(what, path, "scale fx, fy, cx and cy to the images' size")

@@ -1,0 +1,199 @@
+"""The loss terms, each visible, and their weighted sum.
+
+The first five are the paper's (section 3.4). 3D points and dense depth are compared relative
+to the true depth, so that far walls don't drown near objects.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from kornia.losses import inverse_depth_smoothness_loss
+from torch import Tensor
+
+from deltas_geom import Matches, PosedViews, Triangulation
+from deltas_nets.config import LossConfig
+from deltas_nets.network.deltas import DepthPrediction
+from deltas_nets.network.densifier import DenseDepth
+from deltas_nets.network.layers import upsample_like
+from deltas_nets.network.matcher import Posterior
+from deltas_nets.targets import Targets, detector_labels, keypoint_targets
+
+
+class Losses(NamedTuple):
+    """Unweighted terms and their weighted sum, scalars."""
+
+    detector: Tensor
+    match: Tensor
+    point: Tensor
+    smoothness: Tensor
+    depth: Tensor
+    gradient: Tensor
+    posterior: Tensor
+    confidence: Tensor
+    spread: Tensor
+    total: Tensor
+
+
+def training_losses(
+    prediction: DepthPrediction,
+    images: Tensor,
+    views: PosedViews,
+    depth: Tensor,
+    config: LossConfig,
+    *,
+    depth_range: tuple[float, float],
+) -> Losses:
+    """All terms for a batch.
+
+    Args:
+        prediction: of the network, whose poses may have been noisy.
+        images: ``(B, V, 3, H, W)`` as the network saw them.
+        views: the true poses.
+        depth: ``(B, V, H, W)`` metres, 0 = unknown.
+        config: weights of the terms.
+        depth_range: as given to the network.
+    """
+    keypoints = prediction.keypoints
+    targets = keypoint_targets(views, depth, keypoints.pixels, depth_range=depth_range)
+    dense = prediction.evidence.dense
+    truth = depth[:, :1]
+    coarse, fine = depth_terms(dense, truth, depth_range=depth_range, decay=config.scale_decay)
+    terms = {
+        "detector": F.cross_entropy(keypoints.logits, detector_labels(images[:, 0])),
+        "match": match_loss(prediction.matches, targets),
+        "point": point_loss(prediction.points, targets),
+        "smoothness": smoothness_loss(prediction.depth, images[:, 0]),
+        "depth": coarse,
+        "gradient": fine,
+        "posterior": posterior_loss(prediction.evidence.posterior, targets),
+        "confidence": confidence_loss(prediction, targets),
+        "spread": spread_loss(dense, truth, depth_range=depth_range),
+    }
+    total = sum((getattr(config, name) * term for name, term in terms.items()), truth.new_zeros(()))
+    return Losses(**terms, total=total)
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of the values where the mask holds; 0 where it holds nowhere."""
+    count = mask.sum()
+    return torch.where(mask, values, 0.0).sum() / count.clamp_min(1)
+
+
+def match_loss(matches: Matches, targets: Targets, *, cap: float = 6.0) -> Tensor:
+    """Smooth L1 between matched and true pixels of the sources, px (paper: L_2d).
+
+    Beyond ``cap`` px a match is of another place altogether: pulling at it teaches nothing,
+    the posterior's cross-entropy does.
+    """
+    used = targets.visible[:, 1:] & matches.mask[:, 1:]
+    error = (matches.pixels[:, 1:] - targets.pixels[:, 1:]).abs().sum(dim=-1)
+    near = used & (error.detach() < cap)
+    return masked_mean(F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none"), near)
+
+
+def point_loss(points: Triangulation, targets: Targets, *, cap: float = 0.25) -> Tensor:
+    """Smooth L1 between triangulated and true points, relative to depth (paper: L_3d)."""
+    error = (points.points - targets.points).abs().sum(dim=-1)
+    relative = error / torch.where(targets.known, targets.depth, 1.0)
+    near = targets.known & points.valid & (relative.detach() < cap)
+    smooth = F.smooth_l1_loss(relative, torch.zeros_like(relative), reduction="none", beta=0.02)
+    return masked_mean(smooth, near)
+
+
+def smoothness_loss(depth: Tensor, image: Tensor) -> Tensor:
+    """Edge-aware smoothness of inverse depth, relative to its mean (paper: L_sm)."""
+    inverse = 1 / depth
+    relative = inverse / inverse.mean(dim=(-2, -1), keepdim=True).detach()
+    loss: Tensor = inverse_depth_smoothness_loss(relative, image)
+    return loss
+
+
+def depth_terms(
+    dense: DenseDepth, depth: Tensor, *, depth_range: tuple[float, float], decay: float
+) -> tuple[Tensor, Tensor]:
+    """Smooth L1 of log depth over four scales (paper: L_d), and L1 of its gradient.
+
+    The finest scale is compared at the image's own resolution, coarser ones with the mean of
+    the log depth in their cells.
+    """
+    known = _known(depth, depth_range)
+    truth = torch.where(known, depth, 1.0).log()
+    value, gradient, weight = truth.new_zeros(()), truth.new_zeros(()), 1.0
+    for scale, predicted in enumerate(dense.log_depth):
+        if scale == 0:
+            goal, mask = truth, known
+            predicted = upsample_like(predicted, truth)
+        else:
+            share = F.adaptive_avg_pool2d(known.float(), predicted.shape[-2:])
+            total = F.adaptive_avg_pool2d(truth * known, predicted.shape[-2:])
+            goal, mask = total / share.clamp_min(1e-6), share > 0.5
+        error = F.smooth_l1_loss(predicted, goal, reduction="none", beta=0.02)
+        value = value + weight * masked_mean(error, mask)
+        if scale < 2:
+            gradient = gradient + weight * _gradient_difference(predicted, goal, mask)
+        weight *= decay
+    return value, gradient
+
+
+def _gradient_difference(predicted: Tensor, goal: Tensor, mask: Tensor) -> Tensor:
+    across = masked_mean(
+        (predicted.diff(dim=-1) - goal.diff(dim=-1)).abs(), mask[..., 1:] & mask[..., :-1]
+    )
+    down = masked_mean(
+        (predicted.diff(dim=-2) - goal.diff(dim=-2)).abs(), mask[..., 1:, :] & mask[..., :-1, :]
+    )
+    return across + down
+
+
+def posterior_loss(posterior: Posterior, targets: Targets, *, width: float = 0.6) -> Tensor:
+    """Cross-entropy of every stage's posterior with a bump at the true inverse depth.
+
+    Args:
+        posterior: over inverse depth, joint or per view.
+        targets: truth.
+        width: standard deviation of the bump, in samples.
+    """
+    known = targets.known[:, None]
+    true = (1 / torch.where(targets.known, targets.depth, 1.0))[:, None, :, None]
+    step = (posterior.inv_depth[..., -1:] - posterior.inv_depth[..., :1]).abs()
+    step = (step / (posterior.inv_depth.shape[-1] - 1)).clamp_min(1e-9)
+    distance = (posterior.inv_depth - true) / step
+    bump = (-distance.square() / (2 * width**2)).softmax(dim=-1)
+    # Only where the true depth is among the samples, and one of them can be read.
+    inside = (distance.abs().amin(dim=-1) < 1) & posterior.mask.any(dim=-1) & known
+    total = true.new_zeros(())
+    for number, logits in enumerate(posterior.stages):
+        entropy = -(bump * logits.log_softmax(dim=-1)).sum(dim=-1)
+        last = number == len(posterior.stages) - 1
+        total = total + (1.0 if last or number == 0 else 0.7) * masked_mean(entropy, inside)
+    return total
+
+
+def confidence_loss(
+    prediction: DepthPrediction, targets: Targets, *, tolerance: float = 0.05
+) -> Tensor:
+    """Cross-entropy of a point's confidence with "its depth is right within 5 %"."""
+    depth = prediction.points.depth[:, 0]
+    right = (depth - targets.depth).abs() < tolerance * targets.depth
+    confidence = prediction.evidence.confidence.clamp(1e-4, 1 - 1e-4)
+    entropy = F.binary_cross_entropy(
+        confidence, (right & prediction.points.valid).float().detach(), reduction="none"
+    )
+    return masked_mean(entropy, targets.known)
+
+
+def spread_loss(dense: DenseDepth, depth: Tensor, *, depth_range: tuple[float, float]) -> Tensor:
+    """Laplace negative log likelihood of the dense map's error under its own spread.
+
+    The error is a constant here: doubt must not become a way to lower the depth loss.
+    """
+    known = _known(depth, depth_range)
+    truth = torch.where(known, depth, 1.0).log()
+    error = (upsample_like(dense.log_depth[0], truth) - truth).abs().detach()
+    log_spread = upsample_like(dense.log_spread, truth)
+    return masked_mean(error * (-log_spread).exp() + log_spread, known)
+
+
+def _known(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
+    return (depth > 0.8 * depth_range[0]) & (depth < 1.2 * depth_range[1])

@@ -1,0 +1,83 @@
+"""Points exchange evidence about their depth before they decide.
+
+A point alone often has several equally good depths. In each round every point looks at the
+posteriors of points that seem to lie on the same surface (attention by features and distance)
+and multiplies its own evidence by theirs.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from deltas_nets.network.layers import zero_initialised
+
+# A neighbour's posterior never rules out a depth altogether.
+_FLOOR = 3e-3
+
+
+class Context(nn.Module):
+    """Rounds of exchange between the N points of an image."""
+
+    def __init__(self, feature_dim: int, *, rounds: int, heads: int) -> None:
+        super().__init__()
+        self.embed = nn.Sequential(nn.Linear(feature_dim + 4, 64), nn.ReLU(), nn.Linear(64, 64))
+        self.rounds = nn.ModuleList([_Round(64, heads) for _ in range(rounds)])
+
+    def forward(self, logits: Tensor, features: Tensor, positions: Tensor) -> list[Tensor]:
+        """Logits after each round, the given ones first.
+
+        Args:
+            logits: ``(B, N, S)`` over inverse depth.
+            features: ``(B, N, C)`` of the points.
+            positions: ``(B, N, 2)`` in image widths.
+        """
+        probability = logits.softmax(dim=-1)
+        entropy = -torch.special.xlogy(probability, probability.clamp_min(1e-9)).sum(-1)
+        peak = probability.amax(dim=-1)
+        state = torch.stack([entropy, peak], dim=-1)
+        points = self.embed(torch.cat([features, state, positions], dim=-1))
+        squared = torch.cdist(positions, positions).square()
+        stages = [logits]
+        for exchange in self.rounds:
+            stages.append(exchange(stages[-1], points, squared))
+        return stages
+
+
+class _Round(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, 16 * heads)
+        self.key = nn.Linear(width, 16 * heads)
+        self.trust = nn.Linear(width, heads)
+        # Attention falls off with distance; the heads start from near to far.
+        self.log_reach = nn.Parameter(torch.linspace(-2.5, -0.7, heads))
+        self.gain = nn.Parameter(torch.full((heads,), 0.7 / heads))
+        self.mix = smooth_scores(1 + heads)
+
+    def forward(self, logits: Tensor, points: Tensor, squared: Tensor) -> Tensor:
+        batch, count, samples = logits.shape
+        query = self.query(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
+        key = self.key(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
+        attention = query @ key.mT / 4
+        attention = attention - squared[:, None] * torch.exp(-2 * self.log_reach)[:, None, None]
+        attention = attention + self.trust(points).mT[:, :, None, :]
+        # A point must not confirm itself.
+        itself = torch.eye(count, dtype=torch.bool, device=logits.device)
+        attention = attention.masked_fill(itself, -1e4).softmax(dim=-1)
+        told = attention @ logits.softmax(dim=-1)[:, None]  # (B, heads, N, S)
+        evidence = (told + _FLOOR).log() - math.log(_FLOOR)
+        rows = torch.cat([logits[:, None] / 10, evidence], dim=1)
+        rows = rows.transpose(1, 2).reshape(batch * count, 1 + self.heads, samples)
+        correction = self.mix(rows).view(batch, count, samples)
+        return logits + (self.gain[:, None, None] * evidence).sum(dim=1) + 4 * correction
+
+
+def smooth_scores(inputs: int) -> nn.Sequential:
+    """A correction of scores by their neighbours along the samples; it starts as none."""
+    return nn.Sequential(
+        nn.Conv1d(inputs, 12, 5, padding=2),
+        nn.ReLU(),
+        zero_initialised(nn.Conv1d(12, 1, 5, padding=2)),
+    )

@@ -1,0 +1,178 @@
+"""DELTAS: the method whole. Start reading here."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from deltas_geom import (
+    Matches,
+    PosedViews,
+    SparseDepth,
+    Triangulation,
+    rasterize_depth,
+    triangulate,
+)
+from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
+from deltas_nets.config import NetworkConfig
+from deltas_nets.network.densifier import DenseDepth, Densifier
+from deltas_nets.network.descriptor import Descriptor
+from deltas_nets.network.detector import Detector, Keypoints
+from deltas_nets.network.encoder import Encoder
+from deltas_nets.network.layers import upsample_like
+from deltas_nets.network.matcher import Posterior, build_matcher
+
+
+class Evidence(NamedTuple):
+    """What the prediction rests on; training supervises it, notebooks show it.
+
+    Attributes:
+        confidence: ``(*B, N)`` probability that a point's depth is right.
+        posterior: belief over inverse depth.
+        dense: log depth at four scales and its spread.
+    """
+
+    confidence: Tensor
+    posterior: Posterior
+    dense: DenseDepth
+
+
+class DepthPrediction(NamedTuple):
+    """Depth of the anchor, and every stage that led to it.
+
+    Attributes:
+        depth: ``(*B, 1, H, W)`` metres along z.
+        std: ``(*B, 1, H, W)`` its standard deviation, metres.
+        keypoints: N points of the anchor.
+        matches: where they are seen in all views.
+        points: triangulated, in the world.
+        sparse: their depth as an image.
+        evidence: posterior, confidence, scales.
+    """
+
+    depth: Tensor
+    std: Tensor
+    keypoints: Keypoints
+    matches: Matches
+    points: Triangulation
+    sparse: SparseDepth
+    evidence: Evidence
+
+    def confidence(self, tolerance: float = 0.05) -> Tensor:
+        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``."""
+        relative_scale = self.std / self.depth / 2**0.5
+        return 1 - torch.exp(-tolerance / relative_scale.clamp_min(1e-6))
+
+
+class Deltas(nn.Module):
+    """Posed images in, metric depth of the first one out.
+
+    Args:
+        config: sizes and choices; the default is `deltas-small`.
+
+    Example:
+        >>> model = Deltas(NetworkConfig()).eval()
+        >>> K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]).expand(2, 3, 3)
+        >>> pose = torch.eye(4).repeat(2, 1, 1)
+        >>> pose[1, 0, 3] = -0.2
+        >>> with torch.no_grad():
+        ...     prediction = model(torch.rand(2, 3, 48, 64), PosedViews(K, pose))
+        >>> prediction.depth.shape
+        torch.Size([1, 48, 64])
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = Encoder()
+        self.detector = Detector(config.detector)
+        self.descriptor = Descriptor(config.descriptor_dim)
+        self.matcher = build_matcher(config.matcher, config.descriptor_dim)
+        self.densifier = Densifier(config.densifier_widths)
+
+    def forward(
+        self,
+        images: Tensor,
+        views: PosedViews,
+        depth_range: tuple[float, float] = (0.5, 10.0),
+        *,
+        num_keypoints: int | None = None,
+        shift: Tensor | None = None,
+    ) -> DepthPrediction:
+        """Predict the depth of view 0.
+
+        Args:
+            images: ``(*B, V, 3, H, W)`` RGB in [0, 1]; view 0 is the anchor, V >= 2.
+            views: their cameras, ``(*B, V)``.
+            depth_range: (near, far) of the search, metres.
+            num_keypoints: instead of the config's.
+            shift: ``(*B, 2)`` moves the spread keypoints, for variety in training.
+
+        Raises:
+            ShapeError: a trailing shape differs, or there is no source.
+            ValueError: the depth range makes no sense.
+        """
+        check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
+        check_depth_range(depth_range)
+        if images.shape[-4] < 2:
+            raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
+        batch, size = images.shape[:-4], (images.shape[-2], images.shape[-1])
+        images = images.reshape(-1, *images.shape[-4:])
+        flat = PosedViews(
+            *(t.expand(*batch, *t.shape[-3:]).reshape(-1, *t.shape[-3:]) for t in views)
+        )
+        if shift is not None:
+            shift = shift.reshape(-1, 2)
+
+        features = self.encoder(images)
+        keypoints = self.detector(
+            features, image_size=size, num_keypoints=num_keypoints, shift=shift
+        )
+        descriptors = self.descriptor(features)
+        # Geometry keeps full precision whatever the network around it runs in.
+        with torch.autocast(images.device.type, enabled=False):
+            matched = self.matcher(
+                keypoints.pixels, descriptors, flat, image_size=size, depth_range=depth_range
+            )
+            matches = matched.matches
+            points = triangulate(flat.proj, matches.pixels, matches.weights, matches.mask)
+            depth = points.depth[:, 0].clamp(0.5 * depth_range[0], 2 * depth_range[1])
+            sparse = rasterize_depth(
+                keypoints.pixels,
+                depth,
+                image_size=size,
+                mask=points.valid,
+                weights=matched.confidence,
+                reduce="mean",
+            )
+        dense = self.densifier(features, sparse)
+
+        full = upsample_like(dense.log_depth[0], images[:, 0]).exp()
+        spread = upsample_like(dense.log_spread, images[:, 0]).exp()
+        prediction = DepthPrediction(
+            depth=full,
+            std=2**0.5 * spread * full,
+            keypoints=keypoints,
+            matches=matches,
+            points=points,
+            sparse=sparse,
+            evidence=Evidence(matched.confidence, matched.posterior, dense),
+        )
+        return _with_batch(prediction, batch)
+
+
+def _with_batch(prediction: DepthPrediction, batch: torch.Size) -> DepthPrediction:
+    """Give the flat batch dim of every tensor the caller's leading dims back."""
+
+    def restore(value: object) -> object:
+        if isinstance(value, Tensor):
+            # Shared tables, such as the sampled inverse depths, have no batch dim.
+            return value.reshape(*batch, *value.shape[1:]) if value.ndim > 1 else value
+        if isinstance(value, tuple):
+            items = [restore(item) for item in value]
+            return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
+        return value
+
+    restored = restore(prediction)
+    assert isinstance(restored, DepthPrediction)
+    return restored

@@ -1,0 +1,115 @@
+"""Interest points of the anchor: detected ones and evenly spread ones.
+
+Source: DeTone et al., SuperPoint (2018): 65 channels at 1/8, one for each pixel of the 8 x 8
+cell and one for "none"; the paper, section 3.1, for the mixture.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from kornia.geometry.subpix import nms2d
+from torch import Tensor, nn
+
+from deltas_nets.config import DetectorConfig
+from deltas_nets.network.encoder import CHANNELS, Features
+from deltas_nets.network.layers import ConvBlock, upsample_like
+
+CELL = 8
+"""Side of a detector cell, pixels."""
+
+
+class Keypoints(NamedTuple):
+    """Interest points of the anchor.
+
+    Attributes:
+        pixels: ``(*B, N, 2)``.
+        scores: ``(*B, N)`` probability of the detection; 0 for points that were spread.
+        logits: ``(*B, 65, H/8, W/8)`` what the detector is trained by.
+    """
+
+    pixels: Tensor
+    scores: Tensor
+    logits: Tensor
+
+
+class Detector(nn.Module):
+    """Head on the anchor's features, and the choice of N points."""
+
+    def __init__(self, config: DetectorConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.coarse = ConvBlock(int(CHANNELS.sixteenth), 48, kernel=1)
+        self.head = nn.Sequential(
+            ConvBlock(48 + int(CHANNELS.eighth), 64), nn.Conv2d(64, CELL * CELL + 1, 1)
+        )
+
+    def forward(
+        self,
+        features: Features,
+        *,
+        image_size: tuple[int, int],
+        num_keypoints: int | None = None,
+        shift: Tensor | None = None,
+    ) -> Keypoints:
+        """Interest points of the anchor.
+
+        Args:
+            features: of all views; only view 0 is looked at.
+            image_size: (height, width).
+            num_keypoints: instead of the config's.
+            shift: ``(B, 2)`` in [0, 1): moves the spread points, for variety in training.
+        """
+        anchor = features.of_anchor()
+        coarse = upsample_like(self.coarse(anchor.sixteenth), anchor.eighth)
+        logits = self.head(torch.cat([coarse, anchor.eighth], dim=1)).float()
+        count = num_keypoints or self.config.num_keypoints
+        spread = spread_points(count, image_size=image_size).to(logits.device)
+        if shift is None:
+            shift = torch.zeros(len(logits), 2, device=logits.device)
+        size = torch.tensor(image_size[::-1], device=logits.device)
+        pixels = (spread + (shift[:, None] * size).floor()).remainder(size)
+        best, scores = self._best(detector_heatmap(logits.detach(), image_size=image_size), count)
+        detected = scores > self.config.threshold
+        pixels[:, : best.shape[1]] = torch.where(
+            detected[..., None], best, pixels[:, : best.shape[1]]
+        )
+        padded = F.pad(torch.where(detected, scores, 0.0), (0, count - scores.shape[1]))
+        return Keypoints(pixels, padded, logits)
+
+    def _best(self, heatmap: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """The strongest local maxima ``(B, n, 2)`` and their probabilities ``(B, n)``."""
+        border, window = self.config.border, 2 * self.config.nms_radius + 1
+        peaks = nms2d(heatmap, (window, window))[:, 0]
+        inner = torch.zeros_like(peaks)
+        inner[:, border:-border, border:-border] = peaks[:, border:-border, border:-border]
+        width = heatmap.shape[-1]
+        wanted = min(int(count * self.config.detected_share), inner[0].numel())
+        scores, index = inner.flatten(1).topk(wanted, dim=1)
+        columns, rows = index % width, index.div(width, rounding_mode="floor")
+        return torch.stack([columns, rows], dim=-1).to(heatmap.dtype), scores
+
+
+def detector_heatmap(logits: Tensor, *, image_size: tuple[int, int]) -> Tensor:
+    """Probability of an interest point at every pixel, ``(B, 1, H, W)``.
+
+    Args:
+        logits: ``(B, 65, ceil(H/8), ceil(W/8))``; the last channel is "none".
+        image_size: (height, width).
+    """
+    heatmap = F.pixel_shuffle(logits.softmax(dim=1)[:, :-1], CELL)
+    return heatmap[..., : image_size[0], : image_size[1]]
+
+
+def spread_points(count: int, *, image_size: tuple[int, int]) -> Tensor:
+    """Evenly spread pixels ``(count, 2)``, whole numbers, the same every time.
+
+    Every prefix of the sequence is spread evenly, so any part of it can be replaced.
+
+    Source: Roberts, The unreasonable effectiveness of quasirandom sequences (2018): R2.
+    """
+    plastic = 1.32471795724474602596
+    steps = torch.tensor([1 / plastic, 1 / plastic**2], dtype=torch.float64)
+    unit = (0.5 + torch.arange(1, count + 1, dtype=torch.float64)[:, None] * steps) % 1
+    size = torch.tensor(image_size[::-1], dtype=torch.float64)
+    return (unit * size).floor().float()

@@ -1,0 +1,147 @@
+"""Image encoder: the trunk of EfficientNet-Lite0, with taps at 1/2 to 1/16.
+
+Source: Tan and Le, EfficientNet (2019); the Lite variant has no squeeze-and-excitation and
+uses ReLU6, so that it is fast and quantisable on CPUs. Module names are those of the public
+Apache-2.0 checkpoint, so that its file loads as it is.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from deltas_nets.errors import UserError
+from deltas_nets.network.layers import ConvBlock
+
+
+class Features(NamedTuple):
+    """Feature maps of B images of V views each; a map at stride r is the image plane sampled coarser.
+
+    Attributes:
+        fine: ``(B, V, 16, H/2, W/2)`` straight from the pixels, for exact localisation.
+        half: ``(B, V, 16, H/2, W/2)``.
+        quarter: ``(B, V, 24, H/4, W/4)``.
+        eighth: ``(B, V, 40, H/8, W/8)``.
+        sixteenth: ``(B, V, 112, H/16, W/16)``.
+    """
+
+    fine: Tensor
+    half: Tensor
+    quarter: Tensor
+    eighth: Tensor
+    sixteenth: Tensor
+
+    def of_anchor(self) -> "Features":
+        """The maps of view 0 alone, ``(B, C, h, w)``."""
+        return Features(*(feature[:, 0] for feature in self))
+
+    def flat(self) -> "Features":
+        """Views as batch: ``(B * V, C, h, w)``."""
+        return Features(*(feature.flatten(0, 1) for feature in self))
+
+
+CHANNELS = Features(16, 16, 24, 40, 112)  # type: ignore[arg-type]
+"""Channels of each map."""
+
+# Expansion, kernel, stride, channels, repeats of the stages up to 1/16.
+_STAGES = (
+    (1, 3, 1, 16, 1),
+    (6, 3, 2, 24, 2),
+    (6, 5, 2, 40, 2),
+    (6, 3, 2, 80, 3),
+    (6, 5, 1, 112, 3),
+)
+_TAPS = (0, 2, 4, 10)  # the last block at each stride
+
+
+class _SameConv(nn.Conv2d):
+    """Convolution padded as TensorFlow does ("same"), which the pretrained weights expect."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        kernel, stride = self.kernel_size[0], self.stride[0]
+        height, width = input.shape[-2:]
+        pad_y = max((-(-height // stride) - 1) * stride + kernel - height, 0)
+        pad_x = max((-(-width // stride) - 1) * stride + kernel - width, 0)
+        padding = (pad_x // 2, pad_x - pad_x // 2, pad_y // 2, pad_y - pad_y // 2)
+        padded = F.pad(input, padding) if pad_x or pad_y else input
+        return F.conv2d(padded, self.weight, self.bias, self.stride, 0, 1, self.groups)
+
+
+def _batch_norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+
+
+class _InvertedResidual(nn.Module):
+    def __init__(self, inputs: int, outputs: int, expand: int, kernel: int, stride: int) -> None:
+        super().__init__()
+        width = inputs * expand
+        self.expands = expand != 1
+        self.residual = stride == 1 and inputs == outputs
+        if self.expands:
+            self._expand_conv = _SameConv(inputs, width, 1, bias=False)
+            self._bn0 = _batch_norm(width)
+        self._depthwise_conv = _SameConv(width, width, kernel, stride, groups=width, bias=False)
+        self._bn1 = _batch_norm(width)
+        self._project_conv = _SameConv(width, outputs, 1, bias=False)
+        self._bn2 = _batch_norm(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.relu6(self._bn0(self._expand_conv(x))) if self.expands else x
+        y = F.relu6(self._bn1(self._depthwise_conv(y)))
+        y = self._bn2(self._project_conv(y))
+        return x + y if self.residual else y
+
+
+class Encoder(nn.Module):
+    """RGB images in [0, 1], any size, to :class:`Features`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._conv_stem = _SameConv(3, 32, 3, 2, bias=False)
+        self._bn0 = _batch_norm(32)
+        blocks: list[nn.Module] = []
+        channels = 32
+        for expand, kernel, stride, outputs, repeats in _STAGES:
+            for repeat in range(repeats):
+                step = stride if repeat == 0 else 1
+                blocks.append(_InvertedResidual(channels, outputs, expand, kernel, step))
+                channels = outputs
+        self._blocks = nn.ModuleList(blocks)
+        self.fine = ConvBlock(3, 16, stride=2)
+
+    def forward(self, images: Tensor) -> Features:
+        """Encode ``(B, V, 3, H, W)``."""
+        batch = images.shape[:2]
+        flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        # The mean and range that the pretrained weights were trained with.
+        x = F.relu6(self._bn0(self._conv_stem((flat - 0.498) / 0.502)))
+        taps = [self.fine(flat)]
+        for number, block in enumerate(self._blocks):
+            x = block(x)
+            if number in _TAPS:
+                taps.append(x)
+        return Features(*(tap.unflatten(0, batch) for tap in taps))
+
+    def load_pretrained(self, file: Path) -> None:
+        """Start from an EfficientNet-Lite0 classification checkpoint.
+
+        Raises:
+            UserError: the file is missing or holds something else.
+        """
+        try:
+            state = torch.load(file, map_location="cpu", weights_only=True)
+        except FileNotFoundError:
+            raise UserError(
+                "no encoder weights", file, "name an EfficientNet-Lite0 checkpoint"
+            ) from None
+        own = {name for name in self.state_dict() if not name.startswith("fine.")}
+        missing = sorted(own - set(state))
+        if missing:
+            raise UserError(
+                f"not an EfficientNet-Lite0 checkpoint (no {missing[0]})",
+                file,
+                "name the file efficientnet-lite0-57934424.pth or one with its keys",
+            )
+        self.load_state_dict({name: state[name] for name in own}, strict=False)

@@ -1,0 +1,262 @@
+"""The folder that the depth command fills: safe to kill, continue, share and refuse.
+
+Files in it are whole (`deltas_nets.atomic_files`), so a frame whose three files exist is
+finished, whenever the run before was killed. summary.json says what made them: written at the
+start (status ``running``) and at the end (``complete``). Several shards may fill one folder;
+each keeps its own summary.I-of-N.json beside the summary of all.
+"""
+
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from deltas_nets.atomic_files import (
+    TEMPORARY,
+    cannot_write,
+    plain,
+    read_depth_png,
+    read_points_ply,
+    write_confidence_png,
+    write_depth_png,
+    write_json,
+    write_points_ply,
+)
+from deltas_nets.errors import UserError
+
+__all__ = [
+    "OutputFolder",
+    "prepare_output",
+    "read_depth_png",
+    "read_points_ply",
+    "write_confidence_png",
+    "write_depth_png",
+    "write_json",
+    "write_points_ply",
+]
+
+WRITER = "deltas depth"
+"""Stands in summary.json and tells our folders from others."""
+SUMMARY = "summary.json"
+SHARD_SUMMARY = re.compile(r"summary\.\d+-of-\d+\.json")
+KINDS = {"depth": ".png", "confidence": ".png", "points": ".ply"}
+
+FrameId = int | str
+
+
+class OutputFolder:
+    """A folder being filled by one run; made by `prepare_output`."""
+
+    def __init__(
+        self, path: Path, *, head: dict[str, Any], frames: dict[str, Any], shard: tuple[int, int]
+    ) -> None:
+        self.path = path
+        self._head = head
+        self._frames = frames  # records of this run and of those it continues, by id
+        self._shard = shard
+
+    def file(self, kind: str, id: FrameId) -> Path:
+        """Where a frame's ``depth``, ``confidence`` or ``points`` are written."""
+        return _file(self.path, kind, id)
+
+    def is_finished(self, id: FrameId) -> bool:
+        """Whether all files of a frame exist, and therefore are complete."""
+        return all(self.file(kind, id).exists() for kind in KINDS)
+
+    def write_frame(
+        self,
+        id: FrameId,
+        *,
+        depth: ArrayLike,
+        probability: ArrayLike,
+        points: ArrayLike,
+        colors: ArrayLike,
+        record: Mapping[str, Any],
+    ) -> None:
+        """Write a frame's three files; ``record`` (status, times) goes to the summary."""
+        write_points_ply(self.file("points", id), points, colors)
+        write_confidence_png(self.file("confidence", id), probability)
+        write_depth_png(self.file("depth", id), depth)
+        self._frames[str(id)] = dict(record)
+
+    def keep_frame(self, id: FrameId) -> None:
+        """Count a frame that an earlier run finished; its record is kept where it had one."""
+        self._frames.setdefault(str(id), {"status": "kept"})
+
+    def write_summary(self, status: str, **more: Any) -> None:
+        """Write the summary: ``running`` at the start, ``complete`` at the end.
+
+        Args:
+            status: ``running`` or ``complete``.
+            more: goes to the summary beside the settings (times, counts).
+        """
+        self._head = self._head | more
+        content = self._head | {"status": status, "frames": self._frames}
+        if self._shard[1] == 1:
+            write_json(self.path / SUMMARY, content)
+            return
+        write_json(_shard_summary(self.path, self._shard), content)
+        # Others may finish between our reading and our writing. Who writes last reads once
+        # more, so the summary that stays has seen everything.
+        parts = self._parts()
+        while True:
+            write_json(self.path / SUMMARY, self._merged(content, parts))
+            seen, parts = parts, self._parts()
+            if seen == parts:
+                return
+
+    def _parts(self) -> list[dict[str, Any]]:
+        """Summaries of the shards that work with our settings."""
+        count = self._shard[1]
+        paths = [_shard_summary(self.path, (index, count)) for index in range(1, count + 1)]
+        parts = [part for path in paths if (part := _read_summary(path)) is not None]
+        return [part for part in parts if part["settings"] == self._head["settings"]]
+
+    def _merged(self, own: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, Any]:
+        earlier = _read_summary(self.path / SUMMARY)
+        frames: dict[str, Any] = {}
+        if earlier is not None and earlier["settings"] == self._head["settings"]:
+            frames |= earlier["frames"]
+        for part in parts:
+            frames |= part["frames"]
+        complete = [part["status"] for part in parts] == ["complete"] * self._shard[1]
+        return own | {"status": "complete" if complete else "running", "frames": frames}
+
+
+def prepare_output(
+    out: str | Path,
+    *,
+    settings: Mapping[str, Any],
+    overwrite: bool = False,
+    forbidden: Path | None = None,
+    shard: tuple[int, int] = (1, 1),
+    frame_ids: Iterable[FrameId] = (),
+    head: Mapping[str, Any] | None = None,
+) -> OutputFolder:
+    """Make or continue a folder for outputs, and write its summary with status ``running``.
+
+    Args:
+        out: the folder; its parents are made too.
+        settings: what the results depend on (weights, views, sizes ...; not the device or
+            the shard). A run continues another only where all of it is equal.
+        overwrite: start again: remove the frames of a run of ours, and use a folder with
+            other contents, in which only files of the same names are replaced.
+        forbidden: the capture. Its own depth/ would be overwritten, so it is never an output.
+        shard: which of how many runs that fill the folder this is, from 1.
+        frame_ids: the frames of this run: what ``overwrite`` removes where others work too.
+        head: goes to the summary beside the settings (versions, counts of lost frames).
+
+    Returns:
+        The folder; frames for which ``is_finished`` are to be kept.
+
+    Raises:
+        UserError: the folder cannot be written, holds something else, or was made with other
+            settings. Nothing in it has been changed then.
+    """
+    out = Path(out)
+    wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
+    if forbidden is not None and out.resolve() == forbidden.resolve():
+        what = "the output folder is the capture itself"
+        raise UserError(what, out, "name another folder with --out")
+    _make_writable(out)
+    # Listed before the summaries are read: what another shard has made by now has a summary.
+    others = [name for name in sorted(os.listdir(out)) if not TEMPORARY.match(name)]
+    summaries = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
+    earlier = [found for name in summaries if (found := _read_summary(out / name)) is not None]
+    if not overwrite:
+        if others and not earlier:
+            what = f"the output folder holds something else ({', '.join(others[:3])})"
+            raise UserError(what, out, "name an empty folder, or add --overwrite")
+        if earlier and earlier[0]["settings"] != wanted:
+            what = f"an earlier run had other settings ({_difference(earlier[0], wanted)})"
+            raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
+    own = _read_summary(out / SUMMARY if shard[1] == 1 else _shard_summary(out, shard))
+    frames = {} if overwrite or own is None else dict(own["frames"])
+    folder = OutputFolder(
+        out,
+        head={"writer": WRITER, "status": "running", **(head or {}), "settings": wanted},
+        frames=frames,
+        shard=shard,
+    )
+    try:
+        # Before the new summary: killed in between, the old one still says what made the rest.
+        if overwrite:
+            _remove_frames(out, frame_ids, everything=bool(earlier) and shard[1] == 1)
+        if shard[1] == 1:
+            _remove_temporary(out)
+        folder.write_summary("running")
+        for kind in KINDS:
+            (out / kind).mkdir(exist_ok=True)
+    except OSError as error:
+        raise cannot_write(Path(error.filename or out), error) from error
+    return folder
+
+
+def _make_writable(out: Path) -> None:
+    """Make the folder and write a file: permission bits mislead on network drives and root."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=out, prefix=".", suffix=".deltas-tmp") as file:
+            file.write(b"x")
+    except OSError as error:
+        raise cannot_write(out, error) from error
+
+
+def _file(out: Path, kind: str, id: FrameId) -> Path:
+    return out / kind / f"{id}{KINDS[kind]}"
+
+
+def _shard_summary(out: Path, shard: tuple[int, int]) -> Path:
+    return out / f"summary.{shard[0]}-of-{shard[1]}.json"
+
+
+def _read_summary(path: Path) -> dict[str, Any] | None:
+    """A summary of ours; None where there is none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(content, dict) or content.get("writer") != WRITER:
+        return None
+    dicts = all(isinstance(content.get(key), dict) for key in ("settings", "frames"))
+    return content if dicts else None
+
+
+def _difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """The settings that differ, as the user would say it: ``views was 3, is 5``."""
+    before = earlier["settings"]
+    names = sorted(before.keys() | wanted.keys())
+    changed = [name for name in names if before.get(name) != wanted.get(name)]
+    words = []
+    for name in changed[:3]:
+        was, now = json.dumps(before.get(name)), json.dumps(wanted.get(name))
+        short = len(was) + len(now) < 60
+        words.append(f"{name} was {was}, is {now}" if short else f"{name} differs")
+    return "; ".join(words) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+
+
+def _remove_frames(out: Path, ids: Iterable[FrameId], *, everything: bool) -> None:
+    """Remove outputs: of these frames, or all that a run of ours has left."""
+    for id in ids:
+        for kind in KINDS:
+            _file(out, kind, id).unlink(missing_ok=True)
+    if everything:
+        for kind, suffix in KINDS.items():
+            for path in (out / kind).glob(f"*{suffix}"):
+                path.unlink()
+        for path in out.iterdir():
+            if SHARD_SUMMARY.fullmatch(path.name):
+                path.unlink()
+
+
+def _remove_temporary(out: Path) -> None:
+    """Remove what a killed run left half written; not beside other shards, which live."""
+    for folder in (out, *(out / kind for kind in KINDS)):
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if TEMPORARY.match(path.name):
+                path.unlink()

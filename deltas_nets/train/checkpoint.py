@@ -1,0 +1,93 @@
+"""The state of a training run in its folder, written so that a kill at any time loses little."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from deltas_nets.atomic_files import write_atomically, write_json
+from deltas_nets.config import TrainConfig, from_dict, to_dict
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.pretrained import save_weights
+from deltas_nets.train.average import RunningAverage
+
+CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetensors"
+
+
+class RunState(NamedTuple):
+    """What a run continues from."""
+
+    model: Deltas
+    average: RunningAverage
+    optimizer: torch.optim.Optimizer
+    step: int
+
+
+def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str) -> None:
+    """Write the config, the checkpoint to resume from and the averaged weights.
+
+    Args:
+        folder: of the run.
+        config: of the run.
+        state: after ``state.step`` steps.
+        origin: what the weights started from, with its licence.
+    """
+    write_json(folder / CONFIG, to_dict(config))
+    content = {
+        "step": state.step,
+        "origin": origin,
+        "model": state.model.state_dict(),
+        "average": state.average.model.state_dict(),
+        "optimizer": state.optimizer.state_dict(),
+    }
+    write_atomically(folder / CHECKPOINT, lambda file: torch.save(content, file))
+    average = state.average.model
+    assert isinstance(average, Deltas)
+    metadata = {
+        "step": str(state.step),
+        "seed": str(config.seed),
+        "data": f"procedural rooms {config.data.seed}..{config.data.seed + config.data.num_rooms}",
+        "origin": origin,
+        "licence": "Apache-2.0",
+        "train": json.dumps(to_dict(config)),
+    }
+    save_weights(folder / WEIGHTS, average, metadata)
+
+
+def load_config(folder: Path) -> TrainConfig:
+    """The config of a run's folder.
+
+    Raises:
+        UserError: it is missing or of another version.
+    """
+    file = folder / CONFIG
+    try:
+        return from_dict(TrainConfig, json.loads(file.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise UserError("nothing to resume", folder, "name the --out of an earlier run") from None
+    except (ValueError, TypeError) as error:
+        raise UserError(f"config is not readable ({error})", file, "start a new run") from None
+
+
+def load_run(folder: Path, state: RunState) -> tuple[RunState, str]:
+    """Put a run's checkpoint into model, average and optimizer.
+
+    Returns:
+        The state with its step, and the origin of the weights.
+
+    Raises:
+        UserError: there is no checkpoint, or it cannot be read.
+    """
+    file = folder / CHECKPOINT
+    try:
+        content: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise UserError("no checkpoint to resume", file, "start without --resume") from None
+    except (RuntimeError, EOFError, ValueError) as error:
+        raise UserError(f"checkpoint is damaged ({error})", file, "start a new run") from None
+    state.model.load_state_dict(content["model"])
+    state.average.model.load_state_dict(content["average"])
+    state.optimizer.load_state_dict(content["optimizer"])
+    return state._replace(step=content["step"]), str(content["origin"])

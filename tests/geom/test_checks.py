@@ -1,0 +1,45 @@
+"""Every shape error says what was expected and what was given."""
+
+import pytest
+import torch
+
+from deltas_geom import ShapeError
+from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
+
+
+def test_a_wrong_trailing_dim_is_named() -> None:
+    with pytest.raises(ShapeError, match=r"pixels must have shape \(\*B, N, 2\), got \(7, 3\)"):
+        check_shapes(pixels=(torch.zeros(7, 3), "N 2"))
+
+
+def test_too_few_dims_are_named() -> None:
+    with pytest.raises(ShapeError, match=r"K must have shape \(\*B, 3, 3\), got \(3,\)"):
+        check_shapes(K=(torch.zeros(3), "3 3"))
+
+
+def test_a_letter_has_one_size_in_all_tensors() -> None:
+    with pytest.raises(ShapeError, match="weights has V = 2 but proj has V = 3"):
+        check_shapes(proj=(torch.zeros(3, 3, 4), "V 3 4"), weights=(torch.zeros(2, 5), "V N"))
+
+
+def test_leading_dims_are_free() -> None:
+    check_shapes(a=(torch.zeros(8, 1, 5, 2), "N 2"), b=(torch.zeros(5, 3), "N 3"))
+
+
+def test_batch_dims_broadcast() -> None:
+    assert batch_shape((2, 1), (3,), ()) == (2, 3)
+
+
+@pytest.mark.parametrize("depth_range", [(0, 1), (2, 1), (-1, 1), (1, 1), (float("nan"), 1)])
+def test_a_depth_range_is_positive_and_ordered(depth_range: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="0 < near < far"):
+        check_depth_range(depth_range)
+
+
+def test_far_may_be_infinite() -> None:
+    check_depth_range((0.5, float("inf")))
+
+
+def test_an_image_has_a_pixel() -> None:
+    with pytest.raises(ValueError, match="height, width"):
+        check_image_size((0, 3))

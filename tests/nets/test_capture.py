@@ -1,0 +1,310 @@
+"""Captures: what is read, what is lost, and one line of error for everything else."""
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from deltas_nets.data.capture import Capture, open_capture
+from deltas_nets.data.readers.scannet import world_from_cam_inverse
+from deltas_nets.errors import UserError
+
+MakeCapture = Callable[..., Path]
+
+
+def line_of(error: pytest.ExceptionInfo[UserError], *parts: str) -> None:
+    """The error is one line, has a remedy, and holds these parts."""
+    text = str(error.value)
+    assert "\n" not in text
+    assert error.value.remedy and text.endswith(error.value.remedy)
+    for part in parts:
+        assert part in text, text
+
+
+def test_an_error_is_one_line_of_what_where_remedy() -> None:
+    error = UserError("it\nbroke", Path("a/b.txt"), "mend it")
+    assert str(error) == "it broke, a/b.txt: mend it"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_frames_come_in_the_order_of_their_numbers(make_capture: MakeCapture) -> None:
+    capture = open_capture(make_capture(num_frames=11))
+    assert list(capture.frames) == list(range(11))
+    assert capture.lost == {}
+
+
+def test_poses_are_inverted(capture: Capture) -> None:
+    assert capture.frame(2).cam_from_world[:3, 3] == pytest.approx([-0.30, 0, 0])
+
+
+def test_images_and_depth_are_read(make_capture: MakeCapture) -> None:
+    folder = make_capture(image_size=(48, 64), depth_size=(24, 32))
+    millimetres = np.full((24, 32), 1500, dtype=np.uint16)
+    millimetres[0, 0], millimetres[0, 1] = 0, 65535
+    Image.fromarray(millimetres).save(folder / "depth" / "1.png")
+    frame = open_capture(folder).frame(1)
+    assert frame.image_size == (48, 64)
+    assert frame.read_image().shape == (48, 64, 3)
+    depth = frame.read_depth()
+    assert depth.dtype == np.float32
+    assert depth[0, :3] == pytest.approx([0, 0, 1.5])
+
+
+def test_a_grey_image_is_read_as_colour(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    Image.new("L", (64, 48), 7).save(folder / "color" / "0.jpg")
+    assert open_capture(folder).frame(0).read_image().shape == (48, 64, 3)
+
+
+def test_a_frame_without_depth_says_so(make_capture: MakeCapture) -> None:
+    frame = open_capture(make_capture(depth_size=None)).frame(0)
+    assert frame.depth_path is None and frame.depth_K is None
+    with pytest.raises(UserError) as error:
+        frame.read_depth()
+    line_of(error, "frame 0", "no sensor depth")
+
+
+@pytest.mark.parametrize("nest", ["scans", "scans_test"])
+def test_a_single_nested_scene_is_found(
+    make_capture: MakeCapture, tmp_path: Path, nest: str
+) -> None:
+    make_capture(path=tmp_path / "top" / nest / "scene0000_00")
+    assert open_capture(tmp_path / "top").path == tmp_path / "top" / nest / "scene0000_00"
+
+
+def test_several_nested_scenes_are_listed(make_capture: MakeCapture, tmp_path: Path) -> None:
+    for name in ("scene0000_00", "scene0001_00"):
+        make_capture(path=tmp_path / "top" / "scans" / name)
+    with pytest.raises(UserError) as error:
+        open_capture(tmp_path / "top")
+    line_of(error, "scans/scene0000_00, scans/scene0001_00", "name one")
+
+
+@pytest.mark.parametrize("value", ["nan", "-inf", "inf"])
+def test_a_pose_that_is_not_finite_is_lost(make_capture: MakeCapture, value: str) -> None:
+    folder = make_capture()
+    (folder / "pose" / "1.txt").write_text("\n".join([f"{value} " * 4] * 4))
+    capture = open_capture(folder)
+    assert list(capture.frames) == [0, 2, 3]
+    assert capture.lost == {1: "the pose is not finite"}
+    with pytest.raises(UserError) as error:
+        capture.frame(1)
+    line_of(error, "frame 1", "not finite", str(folder), "0, 2, 3")
+
+
+def test_an_image_without_pose_is_lost_and_a_pose_without_image_ignored(
+    make_capture: MakeCapture,
+) -> None:
+    folder = make_capture()
+    (folder / "pose" / "2.txt").unlink()
+    (folder / "color" / "3.jpg").unlink()
+    capture = open_capture(folder)
+    assert (list(capture.frames), list(capture.lost)) == ([0, 1], [2])
+
+
+def test_an_unknown_frame_names_the_nearest(capture: Capture) -> None:
+    with pytest.raises(UserError) as error:
+        capture.frame(99)
+    line_of(error, "no frame 99", str(capture.path), "0, 1, 2, 3")
+
+
+def write_to(name: str, content: str | bytes) -> Callable[[Path], None]:
+    raw = content if isinstance(content, bytes) else content.encode()
+
+    def edit(folder: Path) -> None:
+        (folder / name).write_bytes(raw)
+
+    return edit
+
+
+def edit_pose(content: str | bytes) -> Callable[[Path], None]:
+    return write_to("pose/1.txt", content)
+
+
+def edit_intrinsics(content: str) -> Callable[[Path], None]:
+    return write_to("intrinsic/intrinsic_color.txt", content)
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    def edit(folder: Path) -> None:
+        path = folder / name
+        path.rename(folder.parent / "elsewhere")
+
+    return edit
+
+
+def twice(folder: Path) -> None:
+    Image.new("RGB", (64, 48)).save(folder / "color" / "01.png")
+
+
+def empty_color(folder: Path) -> None:
+    for path in (folder / "color").iterdir():
+        path.unlink()
+
+
+def other_numbers(folder: Path) -> None:
+    for path in list((folder / "pose").iterdir()):
+        path.rename(path.with_name(f"9{path.name}"))
+
+
+def all_lost(folder: Path) -> None:
+    for path in (folder / "pose").iterdir():
+        path.write_text("nan " * 16)
+
+
+def no_images(folder: Path) -> None:
+    for path in (folder / "color").iterdir():
+        path.write_bytes(b"")
+
+
+POSE, K_FILE = "pose/1.txt", "intrinsic/intrinsic_color.txt"
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+FAULTS = {
+    "no color": (remove("color"), "", "no folder color"),
+    "no pose folder": (remove("pose"), "", "no folder pose"),
+    "empty color": (empty_color, "color", "no numbered images"),
+    "two files a frame": (twice, "color", "frame 1 (01.png and 1.jpg)"),
+    "no pose belongs": (other_numbers, "pose", "no pose belongs to an image"),
+    "all poses lost": (all_lost, "pose", "every pose is lost"),
+    "no image decodes": (no_images, "color/0.jpg", "can be decoded"),
+    "pose of 12": (edit_pose("1 " * 12), POSE, "12 numbers, not 16"),
+    "empty pose": (edit_pose(""), POSE, "0 numbers, not 16"),
+    "pose of words": (edit_pose("hello world"), POSE, "'hello'"),
+    "binary pose": (edit_pose(b"\xff\xfe\x00\x80"), POSE, "not text"),
+    "scaled pose": (edit_pose(IDENTITY.replace("1 0 0 0 0", "1.1 0 0 0 0", 1)), POSE, "not rigid"),
+    "zero pose": (edit_pose("0 " * 15 + "1"), POSE, "not rigid"),
+    "mirrored pose": (edit_pose("-" + IDENTITY), POSE, "mirrors"),
+    "last row": (edit_pose(IDENTITY[:-1] + "2"), POSE, "last row"),
+    "no intrinsics": (remove(K_FILE), K_FILE, "missing"),
+    "intrinsics of 12": (edit_intrinsics("1 " * 12), K_FILE, "12 numbers"),
+    "intrinsics of words": (edit_intrinsics("fx fy"), K_FILE, "'fx'"),
+    "infinite intrinsics": (edit_intrinsics("nan 0 32 0 9 24 0 0 1"), K_FILE, "not finite"),
+    "negative focal": (edit_intrinsics("-9 0 32 0 9 24 0 0 1"), K_FILE, "not positive"),
+    "transposed K": (edit_intrinsics("9 0 0 0 9 0 32 24 1"), K_FILE, "not a camera matrix"),
+    "larger images' K": (edit_intrinsics("90 0 65 0 90 48 0 0 1"), K_FILE, "another resolution"),
+    "smaller images' K": (edit_intrinsics("9 0 16 0 9 12 0 0 1"), K_FILE, "another resolution"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_broken_capture_is_one_line_that_names_the_file(
+    make_capture: MakeCapture, name: str
+) -> None:
+    edit, where, what = FAULTS[name]
+    folder = make_capture()
+    edit(folder)
+    with pytest.raises(UserError) as error:
+        open_capture(folder)
+    line_of(error, str(folder / where), what)
+
+
+def test_a_path_that_is_no_capture_says_what_one_is(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "nest" / "scans").mkdir(parents=True)
+    for name, what in [
+        ("nowhere", "does not exist"),
+        ("file", "not a folder"),
+        ("empty", "no folder color"),
+        ("nest", "no scene inside"),
+    ]:
+        with pytest.raises(UserError) as error:
+            open_capture(tmp_path / name)
+        line_of(error, str(tmp_path / name), what)
+
+
+def test_a_three_by_three_is_as_good_as_four_by_four(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    edit_intrinsics("60 0 32 0 0 60 24 0 0 0 1 0 0 0 0 1")(folder)
+    four = open_capture(folder).frame(0).K
+    edit_intrinsics("60 0 32 0 60 24 0 0 1")(folder)
+    assert np.array_equal(four, open_capture(folder).frame(0).K)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_a_truncated_image_opens_but_does_not_read(make_capture: MakeCapture, suffix: str) -> None:
+    folder = make_capture()
+    path = folder / "color" / f"1.{suffix}"
+    image = Image.open(folder / "color" / "0.jpg")
+    (folder / "color" / "1.jpg").unlink()
+    image.save(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    frame = open_capture(folder).frame(1)
+    with pytest.raises(UserError) as error:
+        frame.read_image()
+    line_of(error, str(path), "truncated")
+
+
+def test_an_image_of_another_size_or_type_does_not_read(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    Image.new("RGB", (32, 24)).save(folder / "color" / "1.jpg")
+    (folder / "color" / "2.jpg").unlink()
+    Image.fromarray(np.zeros((48, 64), np.uint16)).save(folder / "color" / "2.png")
+    (folder / "depth" / "3.png").unlink()
+    Image.new("L", (64, 48)).save(folder / "depth" / "3.png")
+    capture = open_capture(folder)
+    with pytest.raises(UserError) as error:
+        capture.frame(1).read_image()
+    line_of(error, str(folder / "color" / "1.jpg"), "32x24", "64x48")
+    with pytest.raises(UserError) as error:
+        capture.frame(2).read_image()
+    line_of(error, str(folder / "color" / "2.png"), "8-bit")
+    with pytest.raises(UserError) as error:
+        capture.frame(3).read_depth()
+    line_of(error, str(folder / "depth" / "3.png"), "16-bit")
+
+
+@settings(deadline=None)
+@given(
+    quaternion=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
+        lambda q: float(np.linalg.norm(q)) > 0.1
+    ),
+    centre=st.lists(st.floats(-1000, 1000), min_size=3, max_size=3),
+)
+def test_the_inverse_of_a_printed_pose_undoes_it(
+    quaternion: list[float], centre: list[float]
+) -> None:
+    w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    world_from_cam[:3, 3] = centre
+    printed = np.round(world_from_cam, 6)
+    inverse = world_from_cam_inverse(printed, path=Path("pose/0.txt"))
+    rotation = inverse[:3, :3]
+    assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-14
+    # The camera's centre goes to the origin whatever the rounding of the rotation, in metres.
+    assert np.abs(rotation @ printed[:3, 3] + inverse[:3, 3]).max() < 1e-9
+    assert np.abs(rotation @ world_from_cam[:3, :3] - np.eye(3)).max() < 5e-6
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("name", "num_frames", "image_size", "depth_size"),
+    [
+        ("hololens", 186, (360, 540), (360, 540)),
+        ("sevenscenes_reg", 67, (480, 640), (480, 640)),
+        ("scannet_sample", 3, (968, 1296), (480, 640)),
+    ],
+)
+def test_real_captures_open(
+    shared_data: Path,
+    name: str,
+    num_frames: int,
+    image_size: tuple[int, int],
+    depth_size: tuple[int, int],
+) -> None:
+    capture = open_capture(shared_data / name)
+    frame = next(iter(capture.frames.values()))
+    assert (len(capture.frames), len(capture.lost)) == (num_frames, 0)
+    assert frame.read_image().shape == (*image_size, 3)
+    assert frame.read_depth().shape == depth_size
+    assert frame.read_depth().max() < 20

@@ -1,0 +1,257 @@
+"""Drawn rooms: shapes, reproducibility, and geometry that all views agree on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from torch.testing import assert_close
+from torch.utils.data import DataLoader, default_collate
+
+from deltas_geom.projection import project, unproject
+from deltas_geom.views import PosedViews
+from deltas_nets.data.posed_images import PosedImages
+from deltas_nets.data.synthetic import Rooms, draw_room, render_room, texture_atlas
+from deltas_nets.data.synthetic.cast import cast_rays
+from deltas_nets.data.synthetic.furniture import BOX, CYLINDER, ELLIPSOID
+from deltas_nets.data.synthetic.scene import Solids
+from deltas_nets.data.synthetic.textures import (
+    GROUNDS,
+    LEVEL_SIZES,
+    PICTURES,
+    TEXELS_PER_TEXTURE,
+    load_picture,
+)
+
+SIZE = (72, 96)
+SEEDS = range(6)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[PosedImages]:
+    return [render_room(seed, num_views=3, image_size=SIZE) for seed in SEEDS]
+
+
+# Shapes and values
+
+
+def test_an_item_has_the_shapes_and_types_it_promises(rooms: list[PosedImages]) -> None:
+    images, views, depth = rooms[0]
+    assert images.shape == (3, 3, *SIZE) and images.dtype == torch.uint8
+    assert views.K.shape == (3, 3, 3) and views.K.dtype == torch.float32
+    assert views.cam_from_world.shape == (3, 4, 4) and views.cam_from_world.dtype == torch.float32
+    assert depth.shape == (3, *SIZE) and depth.dtype == torch.float32
+
+
+def test_every_pixel_has_a_depth_within_a_house(rooms: list[PosedImages]) -> None:
+    depth = torch.stack([room.depth for room in rooms])
+    assert depth.isfinite().all()
+    assert depth.min() > 0.2 and depth.max() < 14  # m
+
+
+def test_exposure_aims_at_a_mean_brightness(rooms: list[PosedImages]) -> None:
+    for room in rooms:
+        assert 0.3 <= room.images.float().mean() / 255 <= 0.55
+
+
+def test_cameras_are_rigid_apart_and_of_the_promised_focal_length() -> None:
+    for seed in range(40):
+        _, views = draw_room(seed, num_views=5, image_size=SIZE, kinds=texture_atlas().kinds)
+        rotation = views.cam_from_world[:, :3, :3]
+        assert_close(rotation @ rotation.mT, torch.eye(3).expand(5, 3, 3), rtol=0, atol=1e-5)
+        assert (torch.linalg.det(rotation) > 0).all()
+        centres = (-rotation.mT @ views.cam_from_world[:, :3, 3:])[..., 0]
+        baselines = F.pdist(centres)
+        assert baselines.min() > 0.02 and baselines.max() < 0.9  # m
+        focal = views.K[:, 0, 0] / SIZE[1]
+        assert ((focal >= 0.75) & (focal <= 1.45)).all()
+
+
+@pytest.mark.parametrize("num_views", [0, 13])
+def test_a_rig_of_no_or_too_many_views_is_an_error(num_views: int) -> None:
+    with pytest.raises(ValueError, match=f"num_views must be 1 to 12, got {num_views}"):
+        render_room(0, num_views=num_views, image_size=SIZE)
+
+
+# Reproducibility
+
+
+def test_a_seed_gives_the_same_room_whatever_was_drawn_before(rooms: list[PosedImages]) -> None:
+    torch.manual_seed(1)
+    np.random.seed(1)
+    before = torch.get_rng_state()
+    assert_same(render_room(2, num_views=3, image_size=SIZE), rooms[2])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_different_seeds_give_different_rooms(rooms: list[PosedImages]) -> None:
+    assert not torch.equal(rooms[0].images, rooms[1].images)
+    assert not torch.equal(rooms[0].depth, rooms[1].depth)
+    assert not torch.equal(rooms[0].views.K, rooms[1].views.K)
+
+
+# Geometry
+
+
+def test_views_agree_on_depth_and_colour_where_both_see(rooms: list[PosedImages]) -> None:
+    seen, agreeing, differences = [], [], []
+    for room in rooms:
+        for source in (1, 2):
+            ratio, difference, inside = compare(room, anchor=0, source=source)
+            visible = inside & (ratio > 0.97)  # else something stands in front
+            close = visible & ((ratio - 1).abs() < 0.01)
+            seen.append(visible.float().mean())
+            agreeing.append(close.sum() / visible.sum())
+            differences.append(difference[close].mean())
+    assert 0.6 < torch.stack(seen).mean() < 0.95
+    assert torch.stack(agreeing).min() > 0.9
+    assert torch.stack(agreeing).mean() > 0.95
+    assert torch.stack(differences).mean() < 6  # grey levels
+
+
+def test_the_agreement_is_no_accident(rooms: list[PosedImages]) -> None:
+    room = rooms[0]
+    # The anchor's only: shrinking all depths alike hardly shows at short baselines.
+    wrong_depth = torch.cat([1.1 * room.depth[:1], room.depth[1:]])
+    ratio, _, inside = compare(room._replace(depth=wrong_depth), anchor=0, source=1)
+    true_ratio, _, true_inside = compare(room, anchor=0, source=1)
+    wrong = ((ratio - 1).abs() < 0.01)[inside].float().mean()
+    right = ((true_ratio - 1).abs() < 0.01)[true_inside].float().mean()
+    assert wrong < right - 0.3
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_pixel_sees_the_first_surface_on_its_ray(seed: int) -> None:
+    """An oracle without rectangles: walk along K^-1 (x, y, 1) in float64."""
+    room, views = draw_room(seed, num_views=1, image_size=SIZE, kinds=texture_atlas().kinds)
+    depth, solid = cast_rays(room.solids, views.K[0], views.cam_from_world[0], image_size=SIZE)
+    y, x = torch.meshgrid(torch.arange(0, SIZE[0], 3), torch.arange(0, SIZE[1], 3), indexing="ij")
+    pixels = torch.stack([x, y, torch.ones_like(x)]).double().flatten(1)
+    rays = torch.linalg.inv(views.K[0].double()) @ pixels
+    z = depth.double()[y, x].flatten()
+    world_from_cam = torch.linalg.inv(views.cam_from_world[0].double())
+
+    def inside(depths: Tensor) -> Tensor:
+        """How far out ``(N, P)`` the points at these depths are; 1 is the surface."""
+        points = world_from_cam[:3, :3] @ (rays * depths) + world_from_cam[:3, 3:]
+        return extent(room.solids, points)
+
+    hit = inside(z).gather(0, solid[y, x].flatten()[None])[0]
+    smallest = room.solids.half_size[solid[y, x].flatten()].amin(dim=1)
+    assert ((hit - 1).abs() * smallest < 1e-4).all()  # m
+    for share in torch.linspace(0.02, 0.999, 60).tolist():
+        before = inside(share * z)
+        assert (before[0] < 1 + 1e-4).all()
+        # Grazing rays and hair-thin solids aside, nothing has been passed over.
+        assert (before[1:] < 1 - 1e-3).sum() == 0
+
+
+def test_the_view_from_inside_along_the_axis_of_a_cylinder_is_finite() -> None:
+    solids = Solids(
+        shape=torch.tensor([BOX, CYLINDER, ELLIPSOID]),
+        centre=torch.tensor([[0.0, 0, 0], [0, 2, 0], [0, -2, 0]]),
+        half_size=torch.tensor([[5.0, 5, 5], [0.5, 1, 0.5], [0.3, 0.3, 0.3]]),
+        local_from_world=torch.eye(3).expand(3, 3, 3),
+    )
+    K = torch.tensor([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]])
+    down = torch.eye(4)
+    down[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # camera z is world y
+    depth, solid = cast_rays(solids, K, down, image_size=(9, 9))
+    assert depth.isfinite().all()
+    assert solid[4, 4] == 1 and depth[4, 4] == 1.0  # the cap
+    assert solid[0, 0] == 0 and depth[0, 0] == 5.0  # the floor
+
+
+# Textures
+
+
+def test_textures_come_from_the_wheel_and_never_from_the_motorcycle() -> None:
+    for name in (*PICTURES, *GROUNDS):
+        assert "motorcycle" not in name
+        assert load_picture(name).mode == "RGB"
+
+
+def test_the_atlas_holds_every_level_of_every_texture() -> None:
+    texels, kinds = texture_atlas()
+    indices = sorted(index for members in kinds.values() for index in members)
+    assert indices == list(range(len(indices)))
+    assert texels.shape == (len(indices) * TEXELS_PER_TEXTURE, 3)
+    assert texels.dtype == torch.uint8
+    first = texels[: LEVEL_SIZES[0] ** 2].float().mean()
+    last = texels[TEXELS_PER_TEXTURE - LEVEL_SIZES[-1] ** 2 : TEXELS_PER_TEXTURE].float().mean()
+    assert_close(first, last, rtol=0, atol=0.5)
+
+
+# The data set
+
+
+def test_a_cached_room_is_the_rendered_room(tmp_path: Path) -> None:
+    rooms = Rooms(2, seed=5, num_views=2, image_size=SIZE, cache_dir=tmp_path / "cache")
+    first, again = rooms[1], rooms[1]
+    assert_same(first, again)
+    assert_same(first, render_room(6, num_views=2, image_size=SIZE))
+    assert [path.suffix for path in (tmp_path / "cache").iterdir()] == [".safetensors"]
+    other = Rooms(2, seed=5, num_views=3, image_size=SIZE, cache_dir=tmp_path / "cache")
+    assert other[1].images.shape[0] == 3  # not the file of two views
+
+
+def test_rooms_batch_like_any_data_set() -> None:
+    rooms = Rooms(2, num_views=2, image_size=SIZE)
+    assert len(rooms) == 2 and len(list(DataLoader(rooms, batch_size=None))) == 2
+    batch = default_collate([rooms[0], rooms[1]])
+    assert isinstance(batch, PosedImages) and isinstance(batch.views, PosedViews)
+    assert batch.images.shape == (2, 2, 3, *SIZE)
+    with pytest.raises(IndexError):
+        rooms[2]
+
+
+def assert_same(a: PosedImages, b: PosedImages) -> None:
+    for left, right in zip(
+        (a.images, *a.views, a.depth), (b.images, *b.views, b.depth), strict=True
+    ):
+        assert left.dtype == right.dtype and torch.equal(left, right)
+
+
+def compare(room: PosedImages, *, anchor: int, source: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Look from the source at what the anchor sees.
+
+    Returns:
+        Per anchor pixel ``(P,)``: the source's depth there over the depth expected, the
+        mean colour difference in grey levels, and whether it is in the image.
+    """
+    height, width = room.depth.shape[-2:]
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([x, y], dim=-1).float().view(1, -1, 2)
+    only_anchor = PosedViews(*(part[anchor : anchor + 1] for part in room.views))
+    points = unproject(only_anchor, pixels, room.depth[anchor].view(1, -1))[0]
+    there = project(PosedViews(*(part[source : source + 1] for part in room.views)), points)
+    place, expected = there.pixels[0], there.depth[0]
+    limit = torch.tensor([width, height]) - 0.5
+    inside = there.in_front[0] & (place > -0.5).all(dim=-1) & (place < limit).all(dim=-1)
+    grid = (2 * (place + 0.5) / (limit + 0.5) - 1).view(1, 1, -1, 2)
+
+    def look_up(image: Tensor, mode: str) -> Tensor:
+        return F.grid_sample(
+            image[None], grid, mode=mode, padding_mode="border", align_corners=False
+        )[0, :, 0]
+
+    # Inverse depth is affine on a plane: bilinear reading is exact there, also when it slants.
+    ratio = 1 / (look_up(1 / room.depth[source, None], "bilinear")[0] * expected)
+    colour = look_up(room.images[source].float(), "bilinear")
+    difference = (colour - room.images[anchor].float().flatten(1)).abs().mean(dim=0)
+    return ratio, difference, inside
+
+
+def extent(solids: Solids, points: Tensor) -> Tensor:
+    """How far out world points ``(3, P)`` are in each solid, ``(N, P)``; 1 is the surface."""
+    offset = points - solids.centre.double()[..., None]  # (N, 3, P)
+    local = (solids.local_from_world.double() @ offset) / solids.half_size.double()[..., None]
+    x, y, z = local.abs().unbind(dim=1)
+    by_shape = {
+        BOX: torch.maximum(torch.maximum(x, y), z),
+        ELLIPSOID: (x * x + y * y + z * z).sqrt(),
+        CYLINDER: torch.maximum(torch.hypot(x, z), y),
+    }
+    return torch.stack([by_shape[shape][n] for n, shape in enumerate(solids.shape.tolist())])

@@ -1,0 +1,221 @@
+"""View sets: a file that names them, a rule that chooses them, and the check of both."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+
+from deltas_nets.data.capture import Capture, Frame, open_capture
+from deltas_nets.data.view_sets import ViewSet, check_frames, choose_view_sets, read_view_sets
+from deltas_nets.errors import UserError
+
+MakeCapture = Callable[..., Path]
+
+
+def write_sets(folder: Path, content: object) -> Path:
+    path = folder / "sets.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def row_of_cameras(centres: np.ndarray, *, turns: np.ndarray | None = None) -> Capture:
+    """Frames without files at ``centres`` (N, 3), turned about y by ``turns`` (N,) rad."""
+    K = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
+    frames = {}
+    for id, centre in enumerate(centres):
+        turn = 0.0 if turns is None else float(turns[id])
+        cos, sin = np.cos(turn), np.sin(turn)
+        pose = np.eye(4)
+        pose[:3, :3] = [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        frames[id] = Frame(id, Path(f"{id}.jpg"), (48, 64), K, pose)
+    return Capture(Path("capture"), MappingProxyType(frames), {})
+
+
+def along_x(*positions: float) -> Capture:
+    return row_of_cameras(np.array([[x, 0.0, 0.0] for x in positions]))
+
+
+def test_sets_are_read_in_order(capture: Capture, tmp_path: Path) -> None:
+    path = write_sets(
+        tmp_path, [{"anchor": 2, "sources": [1, 3]}, {"anchor": 0, "sources": [1], "note": "x"}]
+    )
+    assert read_view_sets(path, capture) == (ViewSet(2, (1, 3)), ViewSet(0, (1,)))
+
+
+GOOD = {"anchor": 2, "sources": [1]}
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("[{", "not JSON"),
+        ("", "not JSON"),
+        ({"anchor": 1}, "not a list"),
+        ([], "empty"),
+        ([GOOD, 3], "view set 2 of 2 is not an object"),
+        ([{"anchor": 1}], "view set 1 of 1 is not an object with anchor and sources"),
+        ([{"anchor": "1", "sources": [2]}], "anchor '1', not a frame number"),
+        ([{"anchor": True, "sources": [2]}], "not a frame number"),
+        ([{"anchor": 1.5, "sources": [2]}], "not a frame number"),
+        ([{"anchor": 1, "sources": 2}], "no list of frame numbers"),
+        ([{"anchor": 1, "sources": ["2"]}], "no list of frame numbers"),
+        ([{"anchor": 1, "sources": []}], "no sources"),
+        ([{"anchor": 1, "sources": [2, 1]}], "among its own sources"),
+        ([{"anchor": 1, "sources": [2, 2]}], "a source twice"),
+        ([GOOD, GOOD], "an earlier set"),
+        ([{"anchor": 77, "sources": [2]}], "frame 77, which"),
+        ([{"anchor": 1, "sources": [-5]}], "the nearest are 0, 1, 2, 3"),
+    ],
+)
+def test_wrong_sets_are_one_line_that_names_the_file(
+    capture: Capture, tmp_path: Path, content: object, what: str
+) -> None:
+    path = write_sets(tmp_path, content)
+    with pytest.raises(UserError) as error:
+        read_view_sets(path, capture)
+    text = str(error.value)
+    assert what in text and str(path) in text and "\n" not in text and error.value.remedy
+
+
+def test_a_file_that_is_missing_or_binary_is_one_line(capture: Capture, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"cannot be read .*missing.json: check"):
+        read_view_sets(tmp_path / "missing.json", capture)
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match=r"not JSON .*binary.json: write"):
+        read_view_sets(tmp_path / "binary.json", capture)
+
+
+def test_a_set_that_names_a_lost_pose_is_an_error(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    (folder / "pose" / "1.txt").write_text("nan " * 16)
+    path = write_sets(folder, [{"anchor": 0, "sources": [1]}])
+    with pytest.raises(UserError, match=r"frame 1, whose pose is unusable .*sets.json: take"):
+        read_view_sets(path, open_capture(folder))
+
+
+def test_an_anchor_may_stand_alone_with_sensor_depth(capture: Capture, tmp_path: Path) -> None:
+    path = write_sets(tmp_path, [{"anchor": 1, "sources": []}])
+    assert read_view_sets(path, capture, allow_no_sources=True) == (ViewSet(1, ()),)
+
+
+def test_frames_that_sets_name_are_decoded_and_others_are_not(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    path = folder / "color" / "3.jpg"
+    path.write_bytes(path.read_bytes()[:-300])
+    capture = open_capture(folder)
+    check_frames(capture, [ViewSet(0, (1, 2))], with_depth=True)
+    with pytest.raises(UserError, match=r"truncated\), .*color/3.jpg: copy"):
+        check_frames(capture, [ViewSet(0, (1, 3))])
+
+
+def test_damaged_sensor_depth_is_found_where_it_is_used(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    path = folder / "depth" / "0.png"
+    path.write_bytes(path.read_bytes()[:60])
+    capture = open_capture(folder)
+    check_frames(capture, [ViewSet(0, (1, 2))])
+    with pytest.raises(UserError, match=r"depth/0.png"):
+        check_frames(capture, [ViewSet(0, (1, 2))], with_depth=True)
+
+
+def test_a_pose_that_is_not_finite_is_found() -> None:
+    capture = along_x(0.0, 0.2)
+    capture.frame(1).cam_from_world[0, 3] = np.nan
+    with pytest.raises(UserError, match=r"pose of frame 1 is not finite, 1.jpg"):
+        check_frames(capture, [ViewSet(1, (0,))])
+
+
+def test_good_baselines_are_preferred_to_short_and_long_ones() -> None:
+    capture = along_x(0.0, 0.02, 0.2, 0.6)
+    (chosen,) = choose_view_sets(capture, 2, anchors=[0])
+    assert chosen == ViewSet(0, (2,))
+
+
+def test_working_depth_scales_the_baseline() -> None:
+    capture = along_x(0.0, 0.02, 0.2, 1.2)
+    assert choose_view_sets(capture, 2, anchors=[0], working_depth=0.25)[0].sources == (1,)
+    assert choose_view_sets(capture, 2, anchors=[0], working_depth=15.0)[0].sources == (3,)
+
+
+def test_sources_lie_on_both_sides_of_the_anchor() -> None:
+    capture = along_x(-0.24, -0.2, 0.0, 0.2, 0.24)
+    (chosen,) = choose_view_sets(capture, 3, anchors=[2])
+    assert len({source < 2 for source in chosen.sources}) == 2
+
+
+def test_a_camera_that_looks_elsewhere_is_not_chosen() -> None:
+    centres = np.array([[0.0, 0, 0], [0.2, 0, 0], [-0.12, 0, 0]])
+    capture = row_of_cameras(centres, turns=np.array([0.0, np.pi, 0.1]))
+    assert choose_view_sets(capture, 3, anchors=[0]) == (ViewSet(0, (2,)),)
+
+
+def test_without_an_acceptable_source_the_best_is_taken() -> None:
+    capture = along_x(0.0, 3.0, 5.0)
+    assert choose_view_sets(capture, 2, anchors=[0]) == (ViewSet(0, (1,)),)
+    still = along_x(1.0, 1.0)
+    assert choose_view_sets(still, 3) == (ViewSet(0, (1,)), ViewSet(1, (0,)))
+
+
+def test_a_distant_origin_changes_nothing() -> None:
+    positions = np.cumsum(np.random.default_rng(1).uniform(-0.1, 0.15, (30, 3)), axis=0)
+    near = choose_view_sets(row_of_cameras(positions), 4)
+    far = choose_view_sets(row_of_cameras(positions + np.array([5e5, 2e5, 0])), 4)
+    assert near == far
+
+
+def test_a_turned_world_changes_nothing() -> None:
+    rng = np.random.default_rng(1)
+    positions = np.cumsum(rng.uniform(-0.1, 0.15, (30, 3)), axis=0)
+    capture = row_of_cameras(positions, turns=np.cumsum(rng.uniform(-0.3, 0.3, 30)))
+    new_from_world = np.eye(4)
+    new_from_world[:3, :3] = [[0.0, 0.6, 0.8], [0.0, -0.8, 0.6], [1.0, 0.0, 0.0]]
+    frames = {
+        id: replace(frame, cam_from_world=frame.cam_from_world @ new_from_world)
+        for id, frame in capture.frames.items()
+    }
+    turned = Capture(capture.path, frames, {})
+    assert choose_view_sets(turned, 4) == choose_view_sets(capture, 4)
+
+
+def test_one_frame_or_one_view_is_an_error(capture: Capture) -> None:
+    with pytest.raises(UserError, match=r"one frame .*capture: depth from views"):
+        choose_view_sets(along_x(0.0), 3)
+    with pytest.raises(UserError, match=r"1 views are too few, --views: use 2"):
+        choose_view_sets(capture, 1)
+
+
+def test_two_thousand_frames_take_seconds() -> None:
+    steps = np.random.default_rng(0).normal(0, 0.05, (2000, 3))
+    capture = row_of_cameras(np.cumsum(steps, axis=0))
+    start = time.process_time()
+    sets = choose_view_sets(capture, 7)
+    assert len(sets) == 2000
+    assert time.process_time() - start < 10
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["hololens", "sevenscenes_reg"])
+def test_chosen_sets_resemble_those_made_by_hand(shared_data: Path, name: str) -> None:
+    capture = open_capture(shared_data / name)
+    given = read_view_sets(shared_data / name / "view_sets.json", capture)
+    check_frames(capture, given[:2], with_depth=True)
+    chosen = choose_view_sets(capture, 3, anchors=[view_set.anchor for view_set in given])
+
+    def mean_baseline(sets: tuple[ViewSet, ...]) -> float:
+        """Metres, over the first two sources."""
+        lengths = []
+        for view_set in sets:
+            world_from_anchor = np.linalg.inv(capture.frame(view_set.anchor).cam_from_world)
+            for source in view_set.sources[:2]:
+                source_from_anchor = capture.frame(source).cam_from_world @ world_from_anchor
+                lengths.append(float(np.linalg.norm(source_from_anchor[:3, 3])))
+        return float(np.mean(lengths))
+
+    assert mean_baseline(chosen) == pytest.approx(mean_baseline(given), rel=0.25)
+    assert all(len(view_set.sources) == 2 for view_set in chosen)
