@@ -43,7 +43,12 @@ def null_vector(matrix: Symmetric4) -> NullVector:
         matrix: positive semidefinite, finite, trace about 1.
     """
     with torch.no_grad():
-        start = _rayleigh(matrix, _inverse_iteration(matrix))
+        near = _inverse_iteration(matrix)
+        nearer = _rayleigh(matrix, near)
+        # Rayleigh iteration may leave for the next eigenvector, where the quotient is larger.
+        better = dot(nearer, multiply(matrix, nearer)) <= dot(near, multiply(matrix, near))
+        x0, x1, x2, x3 = (torch.where(better, b, a) for a, b in zip(near, nearer, strict=True))
+        start = (x0, x1, x2, x3)
         converged = dot(start, start).isfinite()
         x0, x1, x2, x3 = (torch.where(converged, component, 0.0) for component in start)
         start = (x0, x1, x2, torch.where(converged, x3, 1.0))
@@ -119,8 +124,9 @@ def _inverse_iteration(matrix: Symmetric4) -> Vector4:
     z2 = -l32
     z1 = -l31 - l21 * z2
     z0 = -l30 - l10 * z1 - l20 * z2
-    # The nudge reaches vectors at infinity, to which e4 may be exactly orthogonal.
-    x = _unit((z0 + 0.013, z1 + 0.007, z2 + 0.011, torch.ones_like(z0)))
+    x0, x1, x2, x3 = _unit((z0, z1, z2, torch.ones_like(z0)))
+    # The nudge reaches vectors near infinity, to which e4 is nearly or exactly orthogonal.
+    x = (x0 + 0.13, x1 + 0.07, x2 + 0.11, x3)
     # Once is enough for good matches; gross outliers bring the next eigenvalue near.
     for _ in range(_INVERSE_ITERATIONS):
         x = _unit(_solve_scaled(factors, x))

@@ -158,7 +158,8 @@ def _solve(
     centers, _ = projection_centers(wide_proj)
     origin, unit = _shared_frame(centers.detach(), solvable.any(dim=-1))
     moved = wide_proj[..., 3:] + wide_proj[..., :3] @ origin.unsqueeze(-2).mT
-    shared = torch.cat([wide_proj[..., :3], moved / unit[..., None, None]], dim=-1)
+    directions = wide_proj[..., :3].expand(*moved.shape[:-1], 3)
+    shared = torch.cat([directions, moved / unit[..., None, None]], dim=-1)
     normal = _normal_matrix(shared, xy, squared)
     shared_centers = (centers - origin) / unit[..., None]
     point_origin, point_unit = _point_frame(shared_centers, squared)

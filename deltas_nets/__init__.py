@@ -1,1 +1,34 @@
-"""Metric depth from posed images: the DELTAS network, its training, weights and command."""
+"""Metric depth from posed images: the DELTAS network, its training, weights and command.
+
+Example:
+    >>> from deltas_nets import load_model
+    >>> model = load_model("deltas-small")
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from deltas_nets.config import NetworkConfig
+    from deltas_nets.data.capture import open_capture
+    from deltas_nets.network.deltas import Deltas, DepthPrediction
+    from deltas_nets.pretrained import load_model
+
+__version__ = "0.1.0"
+
+__all__ = ["Deltas", "DepthPrediction", "NetworkConfig", "load_model", "open_capture"]
+
+_HOMES = {
+    "Deltas": "deltas_nets.network.deltas",
+    "DepthPrediction": "deltas_nets.network.deltas",
+    "NetworkConfig": "deltas_nets.config",
+    "load_model": "deltas_nets.pretrained",
+    "open_capture": "deltas_nets.data.capture",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # On first use, so that `deltas --help` does not wait for torch.
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -125,8 +125,9 @@ def depth_terms(
             goal, mask = truth, known
             predicted = upsample_like(predicted, truth)
         else:
-            share = F.adaptive_avg_pool2d(known.float(), predicted.shape[-2:])
-            total = F.adaptive_avg_pool2d(truth * known, predicted.shape[-2:])
+            size = (predicted.shape[-2], predicted.shape[-1])
+            share = F.adaptive_avg_pool2d(known.float(), size)
+            total = F.adaptive_avg_pool2d(truth * known, size)
             goal, mask = total / share.clamp_min(1e-6), share > 0.5
         error = F.smooth_l1_loss(predicted, goal, reduction="none", beta=0.02)
         value = value + weight * masked_mean(error, mask)

@@ -1,0 +1,1 @@
+"""Captures, view sets, samples and procedural rooms."""

@@ -58,9 +58,8 @@ def resize(batch: PosedImages, size: tuple[int, int]) -> PosedImages:
     old = (batch.images.shape[-2], batch.images.shape[-1])
     if old == size:
         return batch
-    images = F.interpolate(
-        batch.images.flatten(0, 1), size=size, mode="bilinear", antialias=True
-    ).unflatten(0, batch.images.shape[:2])
+    images = F.interpolate(batch.images.flatten(0, 1), size=size, mode="bilinear", antialias=True)
+    images = images.reshape(*batch.images.shape[:-2], *size)
     depth = F.interpolate(batch.depth, size=size, mode="nearest-exact")
     return PosedImages(images, batch.views.resize(old_size=old, new_size=size), depth)
 
@@ -85,7 +84,7 @@ class Photometry(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             changed: Tensor = self.steps(images.flatten(0, 1))
-        return changed.clamp(0, 1).unflatten(0, images.shape[:2])
+        return changed.clamp(0, 1).reshape(images.shape)
 
 
 def disturb_poses(

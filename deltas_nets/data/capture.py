@@ -23,7 +23,7 @@ UNKNOWN_DEPTH = 65535
 class Frame:
     """One image, the camera that took it, and the depth a sensor measured, if any."""
 
-    id: int
+    id: int | str
     image_path: Path
     image_size: tuple[int, int]
     """(height, width) of the image file."""
@@ -85,21 +85,21 @@ class Capture:
     """The folder that holds the images' folder: the scene, where captures are nested."""
     frames: Mapping[int, Frame]
     """Frames with a usable pose, in the order of their ids."""
-    lost: Mapping[int, str]
-    """Frames left out because of their pose, with the reason."""
+    lost: Mapping[int, UserError]
+    """Frames left out because of their pose, with the error that asking for them raises."""
 
     def frame(self, id: int) -> Frame:
         """The frame called ``id``.
 
         Raises:
-            UserError: there is none, or its pose was lost; names the nearest ids.
+            UserError: there is none (names the nearest ids), or its pose was lost.
         """
         if id in self.frames:
             return self.frames[id]
+        if id in self.lost:
+            raise self.lost[id]
         nearest = sorted(sorted(self.frames, key=lambda other: (abs(other - id), other))[:4])
         remedy = f"use a frame it has; the nearest are {ids_in_words(nearest)}"
-        if id in self.lost:
-            raise UserError(f"frame {id} has no usable pose ({self.lost[id]})", self.path, remedy)
         raise UserError(f"the capture has no frame {id}", self.path, remedy)
 
 

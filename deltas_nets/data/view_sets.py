@@ -115,7 +115,9 @@ def choose_view_sets(
         raise UserError(what, capture.path, "depth from views needs two frames or more")
     ids = list(capture.frames)
     index_of = {id: index for index, id in enumerate(ids)}
-    wanted = ids if anchors is None else [capture.frame(id).id for id in anchors]
+    wanted = ids if anchors is None else list(anchors)
+    for id in wanted:
+        capture.frame(id)
     poses = np.stack([capture.frames[id].cam_from_world for id in ids])
     centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
 
@@ -176,8 +178,7 @@ def _check_ids(
         raise UserError(what, path, "name each source once")
     for id in (anchor, *sources):
         if id in capture.lost:
-            what = f"{name} names frame {id}, whose pose is unusable ({capture.lost[id]})"
-            raise UserError(what, path, "take the frame out of the set")
+            raise capture.lost[id]
         if id not in capture.frames:
             nearest = sorted(capture.frames, key=lambda other: (abs(other - id), other))[:4]
             what = f"{name} names frame {id}, which {capture.path} does not have"

@@ -61,7 +61,8 @@ def depth_metrics(
     used = known & np.isfinite(p) & (p > 0)
     coverage = float(used.sum() / known.sum())
     if not used.any():
-        return DepthMetrics(*[float("nan")] * 8, coverage=0.0)
+        nothing = dict.fromkeys(DepthMetrics._fields, float("nan"))
+        return DepthMetrics(**nothing | {"coverage": 0.0})
     p, g = p[used], g[used]
     error, ratio = p - g, np.maximum(p / g, g / p)
     return DepthMetrics(

@@ -20,7 +20,8 @@ def evaluate_rooms(
     """
     device = next(model.parameters()).device
     dense, sparse = [], []
-    for room in rooms:
+    for index in range(len(rooms)):
+        room = rooms[index]
         prediction = model(
             (room.images.float() / 255).to(device),
             PosedViews(*(tensor.to(device) for tensor in room.views)),

@@ -71,7 +71,9 @@ class _Round(nn.Module):
         rows = torch.cat([logits[:, None] / 10, evidence], dim=1)
         rows = rows.transpose(1, 2).reshape(batch * count, 1 + self.heads, samples)
         correction = self.mix(rows).view(batch, count, samples)
-        return logits + (self.gain[:, None, None] * evidence).sum(dim=1) + 4 * correction
+        told_in_all = (self.gain[:, None, None] * evidence).sum(dim=1)
+        updated: Tensor = logits + told_in_all + 4 * correction
+        return updated
 
 
 def smooth_scores(inputs: int) -> nn.Sequential:

@@ -1,6 +1,6 @@
 """DELTAS: the method whole. Start reading here."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -164,7 +164,7 @@ class Deltas(nn.Module):
 def _with_batch(prediction: DepthPrediction, batch: torch.Size) -> DepthPrediction:
     """Give the flat batch dim of every tensor the caller's leading dims back."""
 
-    def restore(value: object) -> object:
+    def restore(value: Any) -> Any:
         if isinstance(value, Tensor):
             # Shared tables, such as the sampled inverse depths, have no batch dim.
             return value.reshape(*batch, *value.shape[1:]) if value.ndim > 1 else value
@@ -173,6 +173,5 @@ def _with_batch(prediction: DepthPrediction, batch: torch.Size) -> DepthPredicti
             return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
         return value
 
-    restored = restore(prediction)
-    assert isinstance(restored, DepthPrediction)
+    restored: DepthPrediction = restore(prediction)
     return restored

@@ -144,4 +144,4 @@ class Densifier(nn.Module):
 
 
 def _pooled_like(fine: Tensor, coarse: Tensor) -> Tensor:
-    return F.adaptive_avg_pool2d(fine, coarse.shape[-2:])
+    return F.adaptive_avg_pool2d(fine, (coarse.shape[-2], coarse.shape[-1]))

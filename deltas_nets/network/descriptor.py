@@ -51,4 +51,7 @@ class Descriptor(nn.Module):
                 context = pyramid
         maps = self.head(torch.cat([pyramid, flat.fine], dim=1)).float()
         unit = F.normalize(maps, dim=1)
-        return Descriptors(unit.unflatten(0, batch), context.float().unflatten(0, batch))
+        context = context.float()
+        return Descriptors(
+            unit.reshape(*batch, *unit.shape[1:]), context.reshape(*batch, *context.shape[1:])
+        )

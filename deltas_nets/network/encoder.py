@@ -17,7 +17,7 @@ from deltas_nets.network.layers import ConvBlock
 
 
 class Features(NamedTuple):
-    """Feature maps of B images of V views each; a map at stride r is the image plane sampled coarser.
+    """Feature maps of B x V images; at stride r the image plane is sampled r times coarser.
 
     Attributes:
         fine: ``(B, V, 16, H/2, W/2)`` straight from the pixels, for exact localisation.
@@ -91,7 +91,8 @@ class _InvertedResidual(nn.Module):
         y = F.relu6(self._bn0(self._expand_conv(x))) if self.expands else x
         y = F.relu6(self._bn1(self._depthwise_conv(y)))
         y = self._bn2(self._project_conv(y))
-        return x + y if self.residual else y
+        output: Tensor = x + y if self.residual else y
+        return output
 
 
 class Encoder(nn.Module):

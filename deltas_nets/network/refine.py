@@ -44,7 +44,7 @@ class RefineMatches(nn.Module):
         axes = torch.stack([direction, normal], dim=-2)  # (B, V-1, N, 2, 2)
         places = pixels.unsqueeze(-2) + self.window @ axes
         read = sample_map(maps[:, 1:], places.flatten(-3, -2), image_size=image_size)
-        read = read.unflatten(-2, places.shape[-3:-1])  # (B, V-1, N, 27, D)
+        read = read.reshape(*places.shape[:-1], -1)  # (B, V-1, N, 27, D)
         correlation = (read @ anchor[:, None, :, :, None]).squeeze(-1)
         prior = (self.window * torch.exp(-self.log_spread)).square().sum(-1) / 2
         found = soft_argmax(

@@ -85,6 +85,7 @@ class BatchMaker:
         self.photometry = Photometry()
 
     def __call__(self, rooms: PosedImages, step: int) -> Batch:
+        """The batch of a step."""
         config = self.config
         seed = config.seed * 1_000_003 + step
         random = torch.Generator().manual_seed(seed)

@@ -78,7 +78,9 @@ def test_lines_do_not_know_the_worlds_origin_axes_or_unit(
     assert_close(distance, torch.zeros_like(distance), rtol=0, atol=1e-7)  # px
 
 
-@given(scene=posed_scenes(), left=st.integers(-99, 99), top=st.integers(-99, 99), half=st.booleans())
+@given(
+    scene=posed_scenes(), left=st.integers(-99, 99), top=st.integers(-99, 99), half=st.booleans()
+)
 def test_distances_are_equivariant_to_resizing_and_cropping(
     scene: PosedScene, left: int, top: int, half: bool
 ) -> None:
@@ -118,9 +120,7 @@ def test_no_finite_input_gives_nan_or_inf(pixels: Tensor, fundamental: Tensor) -
 @given(scene=posed_scenes())
 def test_opencv_draws_the_same_lines(scene: PosedScene) -> None:
     fundamental = fundamental_between(scene.views)
-    theirs = cv2.computeCorrespondEpilines(
-        scene.pixels[0].numpy()[:, None], 1, fundamental.numpy()
-    )
+    theirs = cv2.computeCorrespondEpilines(scene.pixels[0].numpy()[:, None], 1, fundamental.numpy())
     ours = epipolar_lines(fundamental, scene.pixels[0])
     assert_close(ours, torch.from_numpy(theirs[:, 0]).to(ours), rtol=1e-6, atol=1e-6)
 

@@ -64,9 +64,7 @@ def test_wrong_arguments_are_named() -> None:
 def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
     scene = forward_motion(dtype=dtype)
     pixels = scene.pixels[0].expand(4, 1, 3, 2)
-    segments = epipolar_segments(
-        scene.views, pixels, depth_range=(0.5, 10), image_size=IMAGE_SIZE
-    )
+    segments = epipolar_segments(scene.views, pixels, depth_range=(0.5, 10), image_size=IMAGE_SIZE)
     assert segments.start.shape == (4, 1, 1, 3, 2) and segments.start.dtype == dtype
     assert segments.status.shape == (4, 1, 1, 3) and segments.status.dtype == torch.int8
 
@@ -226,7 +224,9 @@ def test_moving_forward_segments_run_away_from_the_epipole() -> None:
 
 
 def test_a_keypoint_at_the_epipole_stays_there() -> None:
-    segments = segments_of((forward_motion().views, torch.tensor([[320.0, 240.0]]).double(), (1, 9)))
+    segments = segments_of(
+        (forward_motion().views, torch.tensor([[320.0, 240.0]]).double(), (1, 9))
+    )
     assert segments.status.item() == Status.NO_PARALLAX
 
 

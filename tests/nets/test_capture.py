@@ -91,10 +91,10 @@ def test_a_pose_that_is_not_finite_is_lost(make_capture: MakeCapture, value: str
     (folder / "pose" / "1.txt").write_text("\n".join([f"{value} " * 4] * 4))
     capture = open_capture(folder)
     assert list(capture.frames) == [0, 2, 3]
-    assert capture.lost == {1: "the pose is not finite"}
+    assert list(capture.lost) == [1]
     with pytest.raises(UserError) as error:
         capture.frame(1)
-    line_of(error, "frame 1", "not finite", str(folder), "0, 2, 3")
+    line_of(error, "frame 1", "not finite", str(folder / "pose" / "1.txt"), "view sets")
 
 
 def test_an_image_without_pose_is_lost_and_a_pose_without_image_ignored(

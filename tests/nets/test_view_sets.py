@@ -95,7 +95,7 @@ def test_a_set_that_names_a_lost_pose_is_an_error(make_capture: MakeCapture) -> 
     folder = make_capture()
     (folder / "pose" / "1.txt").write_text("nan " * 16)
     path = write_sets(folder, [{"anchor": 0, "sources": [1]}])
-    with pytest.raises(UserError, match=r"frame 1, whose pose is unusable .*sets.json: take"):
+    with pytest.raises(UserError, match=r"frame 1 is not finite, .*1.txt: repair it or take"):
         read_view_sets(path, open_capture(folder))
 
 

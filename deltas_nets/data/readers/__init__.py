@@ -1,0 +1,1 @@
+"""Readers of posed captures, one file a format."""

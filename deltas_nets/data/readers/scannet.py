@@ -22,6 +22,9 @@ SPREAD = (0.35, 0.65)
 because a refusal has no way around it. Images resized by 0.76 or 1.43 are found."""
 
 
+_NO_POSE = "repair it or take the frame out of the view sets"
+
+
 def recognises(path: Path) -> bool:
     """Whether this folder, or a folder of scenes inside it, is laid out this way."""
     return _is_scene(path) or any((path / name).is_dir() for name in NESTING)
@@ -50,14 +53,15 @@ def read(path: Path) -> Capture:
         depth_K = _read_intrinsics(depth_intrinsics, _common_size(list(depths.values())))
 
     frames: dict[int, Frame] = {}
-    lost: dict[int, str] = {}
+    lost: dict[int, UserError] = {}
     for id, image_path in images.items():
         if id not in poses:
-            lost[id] = "there is no pose file"
+            file = scene / "pose" / f"{id}.txt"
+            lost[id] = UserError(f"frame {id} has no pose file", file, _NO_POSE)
             continue
         world_from_cam = _read_pose(poses[id])
         if not np.isfinite(world_from_cam).all():
-            lost[id] = "the pose is not finite"
+            lost[id] = UserError(f"the pose of frame {id} is not finite", poses[id], _NO_POSE)
             continue
         cam_from_world = world_from_cam_inverse(world_from_cam, path=poses[id])
         depth_path = depths.get(id)

@@ -1,0 +1,232 @@
+"""Correlation, soft-argmax, and matches of both kinds."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import (
+    Samples,
+    ShapeError,
+    correlate,
+    epipolar_segments,
+    match_joint,
+    match_per_view,
+    sample_inv_depths,
+    sample_map,
+    sample_segments,
+    soft_argmax,
+    triangulate,
+)
+from deltas_geom.testing import PosedScene, forward_motion
+from deltas_geom.testing.scenes import IMAGE_SIZE
+from deltas_geom.testing.strategies import extreme, image_pixels, posed_scenes, vectors
+
+INV_DEPTHS = torch.linspace(0.05, 0.8, 31, dtype=torch.float64)  # 1/m
+
+
+def all_read(pixels: Tensor) -> Samples:
+    """Samples ``(1, N, O=1, S=1)`` at pixels ``(N, 2)`` of one source."""
+    places = pixels[None, :, None, None, :]
+    return Samples(places, places[..., 0, :, 0], torch.ones(places.shape[:-1], dtype=torch.bool))
+
+
+def test_wrong_arguments_are_named() -> None:
+    samples = all_read(torch.zeros(5, 2))
+    with pytest.raises(ShapeError, match="descriptors"):
+        correlate(torch.zeros(3), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
+    with pytest.raises(ShapeError, match="feature_map has D = 3 but descriptors has D = 2"):
+        correlate(torch.zeros(5, 2), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
+    with pytest.raises(ShapeError, match="positions has S = 3 but logits has S = 2"):
+        soft_argmax(torch.zeros(2), torch.zeros(3, 1))
+    segments = epipolar_segments(
+        forward_motion().views, torch.zeros(5, 2).double(), depth_range=(1, 2), image_size=(9, 9)
+    )
+    samples = sample_segments(segments, 4, offsets=(0, 1))
+    with pytest.raises(ValueError, match="without offsets"):
+        match_per_view(torch.zeros(5, 2), samples.pixels[..., 0], samples, window=1)
+
+
+def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    samples = sample_inv_depths(
+        scene.views, scene.pixels[0], INV_DEPTHS.to(dtype), image_size=IMAGE_SIZE
+    )
+    features = torch.rand(4, 1, 1, 6, 12, 16, dtype=dtype)
+    scores = correlate(torch.rand(2, 3, 6, dtype=dtype), features, samples, image_size=IMAGE_SIZE)
+    assert scores.shape == (4, 2, 1, 3, 1, 31) and scores.dtype == dtype
+    matches = match_joint(scene.views, scene.pixels[0], scores, samples, image_size=IMAGE_SIZE)
+    assert matches.pixels.shape == (4, 2, 2, 3, 2) and matches.weights.shape == (4, 2, 2, 3)
+    matches = match_per_view(scene.pixels[0], scores, samples, window=3)
+    assert matches.pixels.shape == (4, 2, 2, 3, 2)
+    assert matches.covariance.shape == (4, 2, 2, 3, 2, 2)
+
+
+def test_no_keypoints_are_no_error() -> None:
+    samples = all_read(torch.zeros(0, 2))
+    scores = correlate(torch.zeros(0, 3), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
+    assert scores.shape == (1, 0, 1, 1)
+    assert match_per_view(torch.zeros(0, 2), scores, samples).pixels.shape == (2, 0, 2)
+
+
+@given(
+    pixels=image_pixels(5, image_size=(24, 32)),
+    descriptors=vectors(5, within=1.0, size=3),
+    features=vectors(48, within=1.0, size=3),
+)
+def test_correlating_then_sampling_is_sampling_then_correlating(
+    pixels: Tensor, descriptors: Tensor, features: Tensor
+) -> None:
+    feature_map = features.mT.reshape(1, 3, 6, 8)
+    scores = correlate(descriptors, feature_map, all_read(pixels), image_size=(24, 32))
+    read = sample_map(feature_map[0], pixels, image_size=(24, 32))
+    assert_close(scores[0, :, 0, 0], (descriptors * read).sum(dim=-1), rtol=0, atol=1e-12)
+
+
+def test_many_keypoints_correlate_as_few_do() -> None:
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.rand(300, 2, generator=generator) * 32
+    descriptors = torch.rand(300, 2, generator=generator)
+    features = torch.rand(1, 2, 64, 64, generator=generator)
+    together = correlate(descriptors, features, all_read(pixels), image_size=(32, 32))
+    for some in (slice(0, 7), slice(60, 200)):
+        alone = correlate(descriptors[some], features, all_read(pixels[some]), image_size=(32, 32))
+        assert_close(together[:, some], alone, rtol=1e-6, atol=1e-6)
+
+
+@given(positions=vectors(7, within=100.0, size=2), place=st.integers(0, 6))
+def test_the_soft_argmax_of_a_delta_is_the_delta(positions: Tensor, place: int) -> None:
+    logits = torch.zeros(7, dtype=torch.float64)
+    logits[place] = 1000.0
+    for window in (None, 0, 2):
+        found = soft_argmax(logits, positions, window=window)
+        assert_close(found.position, positions[place], rtol=0, atol=1e-12)
+        assert found.peak == 1 and found.mass == 1 and found.entropy == 0
+        assert (found.covariance == 0).all()
+
+
+@given(
+    logits=vectors(1, within=5.0, size=7),
+    positions=vectors(7, within=10.0, size=2),
+    shift=vectors(1, within=100.0, size=2),
+    constant=st.floats(-100, 100),
+)
+def test_soft_argmax_is_shift_equivariant(
+    logits: Tensor, positions: Tensor, shift: Tensor, constant: float
+) -> None:
+    found = soft_argmax(logits[0], positions)
+    moved = soft_argmax(logits[0] + constant, positions + shift)
+    assert_close(moved.position, found.position + shift[0], rtol=0, atol=1e-10)
+    assert_close(moved.covariance, found.covariance, rtol=0, atol=1e-9)
+    assert_close(moved.entropy, found.entropy, rtol=0, atol=1e-10)
+
+
+@given(logits=vectors(1, within=5.0, size=7), positions=vectors(7, within=10.0, size=1))
+def test_soft_argmax_is_the_mean_and_variance_of_the_softmax(
+    logits: Tensor, positions: Tensor
+) -> None:
+    found = soft_argmax(logits[0], positions)
+    probability, x = logits[0].softmax(dim=-1).numpy(), positions[:, 0].numpy()
+    mean = (probability * x).sum()
+    assert found.position.item() == pytest.approx(mean, abs=1e-12)
+    assert found.covariance.item() == pytest.approx(
+        (probability * (x - mean) ** 2).sum(), abs=1e-10
+    )
+    assert found.peak.item() == pytest.approx(probability.max(), abs=1e-14)
+
+
+@given(logits=vectors(1, within=5.0, size=7), positions=vectors(7, within=10.0, size=2))
+def test_what_is_masked_may_hold_anything(logits: Tensor, positions: Tensor) -> None:
+    mask = torch.tensor([True, False, True, True, True, True, False])
+    found = soft_argmax(logits[0][mask], positions[mask])
+    spoilt = logits[0].masked_fill(~mask, torch.nan).requires_grad_()
+    places = positions.masked_fill(~mask[:, None], torch.nan).requires_grad_()
+    masked = soft_argmax(spoilt, places, mask=mask)
+    for ours, wanted in zip(masked, found, strict=True):
+        assert_close(ours, wanted, rtol=0, atol=1e-12)
+    for gradient in torch.autograd.grad(masked.position.sum() + masked.entropy, (spoilt, places)):
+        assert gradient.isfinite().all() and (gradient[~mask] == 0).all()
+
+
+@given(logits=extreme(5), positions=extreme(5, 2, decades=15))
+def test_no_finite_logit_gives_nan_or_inf(logits: Tensor, positions: Tensor) -> None:
+    for dtype in (torch.float32, torch.float64):
+        scores = logits.to(dtype).requires_grad_()
+        for mask in (None, torch.zeros(5, dtype=torch.bool)):
+            for window in (None, 1):
+                found = soft_argmax(scores, positions.to(dtype), mask=mask, window=window)
+                assert all(value.isfinite().all() for value in found)
+                total = found.position.sum() + found.peak + found.mass + found.entropy
+                assert torch.autograd.grad(total, scores)[0].isfinite().all()
+
+
+@given(scene=posed_scenes(num_views=3), place=st.integers(2, 28))
+def test_joint_matches_triangulate_to_the_depth_that_all_views_prefer(
+    scene: PosedScene, place: int
+) -> None:
+    samples = sample_inv_depths(scene.views, scene.pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
+    scores = torch.zeros(2, 4, 1, 31, dtype=torch.float64)
+    scores[..., place] = 1000.0
+    matches = match_joint(scene.views, scene.pixels[0], scores, samples, image_size=IMAGE_SIZE)
+    both = samples.mask[:, :, 0, place]
+    assert (matches.mask[1:] == both).all()
+    found = triangulate(scene.views.proj, matches.pixels, matches.weights, matches.mask)
+    depth = torch.where(found.valid, found.depth[0], 1 / INV_DEPTHS[place])
+    assert_close(depth, (1 / INV_DEPTHS[place]).expand(4), rtol=1e-9, atol=0)
+    assert (found.valid == both.any(dim=0)).all()
+
+
+@given(scene=posed_scenes(num_views=3), place=st.integers(0, 30))
+def test_a_match_of_one_view_is_its_best_sample(scene: PosedScene, place: int) -> None:
+    samples = sample_inv_depths(scene.views, scene.pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
+    scores = torch.zeros(2, 4, 1, 31, dtype=torch.float64)
+    scores[..., place] = 1000.0
+    matches = match_per_view(scene.pixels[0], scores, samples)
+    seen = samples.mask[:, :, 0, place]
+    offset = matches.pixels[1:] - samples.pixels[:, :, 0, place]
+    offset = torch.where(seen[..., None], offset, 0.0)
+    assert_close(offset, torch.zeros_like(offset), rtol=0, atol=1e-9)  # px
+    assert (matches.weights[1:][seen] == 1).all()
+    assert_close(matches.pixels[0], scene.pixels[0], rtol=0, atol=0)
+    assert (matches.weights[0] == 1).all() and (matches.covariance[0] == 0).all()
+
+
+def test_scores_of_views_that_see_nothing_do_not_count() -> None:
+    scene = forward_motion()
+    samples = sample_inv_depths(scene.views, scene.pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
+    blind = samples._replace(mask=torch.zeros_like(samples.mask))
+    scores = torch.full((1, 3, 1, 31), torch.nan, dtype=torch.float64, requires_grad=True)
+    for matches in (
+        match_joint(scene.views, scene.pixels[0], scores, blind, image_size=IMAGE_SIZE),
+        match_per_view(scene.pixels[0], scores, blind),
+    ):
+        assert all(value.isfinite().all() for value in matches)
+        assert (matches.weights[1:] == 0).all()
+        gradient = torch.autograd.grad(matches.pixels.sum(), scores, allow_unused=True)[0]
+        assert gradient is None or (gradient == 0).all()
+
+
+def test_gradients_are_right() -> None:
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
+
+    mask = torch.tensor([True, True, False, True, True])
+    for window in (None, 1):
+
+        def moments(
+            logits: Tensor, positions: Tensor, window: int | None = window
+        ) -> tuple[Tensor, ...]:
+            return tuple(soft_argmax(logits, positions, mask=mask, window=window))
+
+        assert torch.autograd.gradcheck(moments, (random(5), random(5, 2)))
+
+    places = all_read((random(3, 2) * 6 + 1).detach())
+
+    def scores(descriptors: Tensor, features: Tensor) -> Tensor:
+        return correlate(descriptors, features, places, image_size=(8, 8))
+
+    assert torch.autograd.gradcheck(scores, (random(3, 2), random(1, 2, 4, 4)))

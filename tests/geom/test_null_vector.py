@@ -1,0 +1,124 @@
+"""The null vector of symmetric 4x4 matrices."""
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom.null_vector import NullVector, Symmetric4, dot, multiply, null_vector
+from deltas_geom.testing.strategies import vectors
+
+ROWS, COLUMNS = torch.triu_indices(4, 4)
+
+
+def packed(matrix: Tensor) -> Symmetric4:
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix[..., ROWS, COLUMNS].unbind(-1)
+    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+
+
+def found(matrix: Tensor) -> tuple[Tensor, NullVector]:
+    result = null_vector(packed(matrix))
+    return torch.stack(result.vector, dim=-1), result
+
+
+@st.composite
+def semidefinite(draw: st.DrawFn, noise: float = 0.0) -> tuple[Tensor, Tensor]:
+    """A matrix of trace 1 with eigenvalues noise, and 0.1 to 0.6, and its null vector."""
+    turned = torch.eye(4, dtype=torch.float64) * 2 + draw(vectors(4, within=0.45, size=4))
+    basis, _ = torch.linalg.qr(turned)
+    values = torch.tensor([0.1, 0.2, 0.3]) + draw(vectors(1, within=0.05))[0] + 0.1
+    values = torch.cat([values, torch.tensor([noise])]).double()
+    return (basis * values) @ basis.mT / values.sum(), basis[:, 3]
+
+
+def test_any_common_shape_is_a_batch(dtype: torch.dtype) -> None:
+    matrix = torch.diag(torch.tensor([0.3, 0.3, 0.4, 0.0], dtype=dtype)).expand(2, 5, 4, 4)
+    vector, result = found(matrix)
+    assert vector.shape == (2, 5, 4) and vector.dtype == dtype and result.simple.all()
+    assert_close(vector[1, 2], torch.tensor([0.0, 0, 0, 1], dtype=dtype))
+
+
+@given(drawn=semidefinite())
+def test_the_null_vector_is_found(drawn: tuple[Tensor, Tensor]) -> None:
+    matrix, wanted = drawn
+    vector, result = found(matrix)
+    assert result.simple and vector[3] >= 0
+    assert_close(vector, wanted * wanted[3].sign(), rtol=0, atol=1e-13)
+
+
+@given(drawn=semidefinite(noise=1e-3))
+def test_with_noise_it_minimises_the_quadratic_form(drawn: tuple[Tensor, Tensor]) -> None:
+    matrix, _ = drawn
+    vector, _ = found(matrix)
+    values, vectors_ = np.linalg.eigh(matrix.numpy())
+    assert abs(float(vector.numpy() @ vectors_[:, 0])) > 1 - 1e-13
+    assert abs(float(vector @ matrix @ vector) - values[0]) < 1e-15
+
+
+def test_packed_products_are_products() -> None:
+    matrix = torch.arange(16.0).reshape(4, 4)
+    matrix = matrix + matrix.mT
+    x = torch.tensor([1.0, -2, 3, 0.5])
+    x0, x1, x2, x3 = x
+    image = multiply(packed(matrix), (x0, x1, x2, x3))
+    assert_close(torch.stack(image), matrix @ x)
+    assert_close(dot((x0, x1, x2, x3), (x0, x1, x2, x3)), x @ x)
+
+
+def test_first_and_second_derivatives_are_right() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.rand(5, 4, generator=generator, dtype=torch.float64)
+    nearly_null = torch.tensor([0.1, -0.5, 0.5, 0.7]).double()
+    rows = rows - 0.9 * torch.outer(rows @ nearly_null, nearly_null)
+
+    def solve(rows: Tensor) -> Tensor:
+        normal = rows.mT @ rows
+        return found(normal / normal.diagonal().sum().detach())[0]
+
+    assert torch.autograd.gradcheck(solve, (rows.requires_grad_(),))
+    assert torch.autograd.gradgradcheck(solve, (rows,))
+
+
+def test_equal_other_eigenvalues_leave_the_gradient_finite_where_eighs_is_nan() -> None:
+    matrix = torch.diag(torch.tensor([0.25, 0.25, 0.5, 0.0])).double().requires_grad_()
+    weights = torch.tensor([1.0, 2, 3, 4]).double()
+    ours = torch.autograd.grad(found(matrix)[0] @ weights, matrix)[0]
+    theirs = torch.autograd.grad(
+        (torch.linalg.eigh(matrix).eigenvectors @ torch.ones(4).double()) @ weights, matrix
+    )[0]
+    assert ours.isfinite().all() and not theirs.isfinite().all()
+
+    def solve(matrix: Tensor) -> Tensor:
+        return found((matrix + matrix.mT) / 2)[0]
+
+    assert torch.autograd.gradcheck(solve, (matrix,))
+
+
+def test_a_vector_at_infinity_is_found() -> None:
+    direction = torch.tensor([2.0, -1, 10, 0]).double() / 105**0.5
+    matrix = (torch.eye(4).double() - torch.outer(direction, direction)) / 3
+    vector, result = found(matrix)
+    assert result.simple and vector[3].abs() < 1e-15
+    assert_close((vector @ direction).abs(), torch.ones(()).double())
+
+
+def test_a_vector_that_is_not_unique_is_told_and_stays_finite() -> None:
+    for diagonal in ([1.0, 0, 0, 0], [0, 0, 0, 1.0], [0.5, 0.5, 0, 0], [0.0, 0, 0, 0]):
+        matrix = torch.diag(torch.tensor(diagonal)).double().requires_grad_()
+        vector, result = found(matrix)
+        assert not result.simple and vector.isfinite().all()
+        assert torch.autograd.grad(vector.sum(), matrix)[0].isfinite().all()
+
+
+def test_gross_outliers_leave_the_smallest_eigenvalue_found() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(2000, 4, 4, generator=generator, dtype=torch.float64)
+    rows[..., 3] *= 0.1
+    normal = rows.mT @ rows
+    normal = normal / normal.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    vector, result = found(normal)
+    smallest = torch.linalg.eigh(normal).eigenvectors[..., 0]
+    wrong = (vector * smallest).sum(dim=-1).abs() < 0.999
+    assert wrong.float().mean() < 0.01 and (wrong & result.simple).float().mean() < 0.005

@@ -1,0 +1,203 @@
+"""Sparse depth images: which pixel, and who wins."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import ShapeError, SparseDepth, rasterize_depth
+from deltas_geom.testing.strategies import extreme, image_pixels, vectors
+
+SIZE = (4, 5)
+KINDS = [(reduce, splat) for reduce in ("front", "mean") for splat in ("pixel", "bilinear")]
+
+
+@st.composite
+def clouds(draw: st.DrawFn, count: int = 8) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels in and around a tiny image, so that they collide; distinct depths; weights."""
+    pixels = 1.2 * draw(image_pixels(count, image_size=SIZE))
+    depth = torch.arange(1.0, count + 1).double()[draw(st.permutations(range(count)))]
+    return pixels, depth, 0.6 + draw(vectors(1, within=0.4, size=count))[0]
+
+
+def rasterize(cloud: tuple[Tensor, Tensor, Tensor], kind: tuple[str, str]) -> SparseDepth:
+    pixels, depth, weights = cloud
+    reduce, splat = kind
+    return rasterize_depth(
+        pixels,
+        depth,
+        image_size=SIZE,
+        weights=weights,
+        reduce=reduce,  # type: ignore[arg-type]
+        splat=splat,  # type: ignore[arg-type]
+    )
+
+
+def test_wrong_arguments_are_named() -> None:
+    pixels, depth = torch.zeros(5, 2), torch.ones(5)
+    with pytest.raises(ShapeError, match="depth has N = 4 but pixels has N = 5"):
+        rasterize_depth(pixels, depth[:4], image_size=SIZE)
+    with pytest.raises(ValueError, match="image_size"):
+        rasterize_depth(pixels, depth, image_size=(0, 5))
+    with pytest.raises(ValueError, match="reduce must be"):
+        rasterize_depth(pixels, depth, image_size=SIZE, reduce="back")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="splat must be"):
+        rasterize_depth(pixels, depth, image_size=SIZE, splat="cubic")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_batch_dims_broadcast(kind: tuple[str, str], dtype: torch.dtype) -> None:
+    pixels = torch.rand(4, 1, 7, 2, dtype=dtype) * 3
+    depth = 1 + torch.rand(3, 7, dtype=dtype)
+    sparse = rasterize((pixels, depth, torch.ones(7, dtype=dtype)), kind)
+    assert sparse.depth.shape == sparse.weight.shape == (4, 3, 1, 4, 5)
+    assert sparse.depth.dtype == dtype
+    alone = rasterize((pixels[2, 0], depth[1], torch.ones(7, dtype=dtype)), kind)
+    assert_close(sparse.depth[2, 1], alone.depth)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_points_are_an_empty_image(kind: tuple[str, str]) -> None:
+    sparse = rasterize((torch.zeros(0, 2), torch.zeros(0), torch.zeros(0)), kind)
+    assert sparse.depth.shape == (1, 4, 5) and (sparse.depth == 0).all()
+
+
+@given(cloud=clouds(), order=st.permutations(range(8)))
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_order_of_points_does_not_count(
+    kind: tuple[str, str], cloud: tuple[Tensor, Tensor, Tensor], order: list[int]
+) -> None:
+    one = rasterize(cloud, kind)
+    pixels, depth, weights = cloud
+    other = rasterize((pixels[order], depth[order], weights[order]), kind)
+    assert_close(other.depth, one.depth, rtol=0, atol=1e-12)  # m
+    assert_close(other.weight, one.weight, rtol=0, atol=1e-12)
+
+
+@given(pixels=vectors(8, within=0.5, size=2), weights=vectors(1, within=0.4, size=8))
+def test_mass_is_conserved(pixels: Tensor, weights: Tensor) -> None:
+    inside = (pixels + 0.5) * torch.tensor([4.0, 3.0]).double()  # among the outer centres
+    masses = weights[0] + 0.5
+    depth = torch.linspace(1, 2, 8).double()
+    sparse = rasterize((inside, depth, masses), ("mean", "bilinear"))
+    assert_close(sparse.weight.sum(), masses.sum(), rtol=0, atol=1e-12)
+    moment = (sparse.weight * sparse.depth).sum()
+    assert_close(moment, (masses * depth).sum(), rtol=0, atol=1e-12)
+
+
+@given(cloud=clouds())
+def test_the_nearest_wins(cloud: tuple[Tensor, Tensor, Tensor]) -> None:
+    pixels, depth, weights = cloud
+    sparse = rasterize(cloud, ("front", "pixel"))
+    cells = (pixels + 0.5).floor()
+    for row in range(4):
+        for column in range(5):
+            here = (cells == torch.tensor([column, row])).all(dim=-1)
+            wanted = depth[here].min().item() if here.any() else 0.0
+            assert sparse.depth[0, row, column] == wanted
+            weight = weights[here][depth[here].argmin()].item() if here.any() else 0.0
+            assert sparse.weight[0, row, column] == weight
+
+
+@given(cloud=clouds())
+def test_the_mean_is_weighted(cloud: tuple[Tensor, Tensor, Tensor]) -> None:
+    pixels, depth, weights = cloud
+    sparse = rasterize(cloud, ("mean", "pixel"))
+    cells = (pixels + 0.5).floor()
+    for row in range(4):
+        for column in range(5):
+            here = (cells == torch.tensor([column, row])).all(dim=-1)
+            total = weights[here].sum()
+            wanted = (weights[here] * depth[here]).sum() / total if here.any() else total
+            assert_close(sparse.depth[0, row, column], wanted, rtol=0, atol=1e-12)  # m
+            assert_close(sparse.weight[0, row, column], total, rtol=0, atol=1e-12)
+
+
+@given(cloud=clouds(), unused=st.integers(0, 7))
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_masked_point_is_a_point_removed(
+    kind: tuple[str, str], cloud: tuple[Tensor, Tensor, Tensor], unused: int
+) -> None:
+    pixels, depth, weights = (value.clone() for value in cloud)
+    rest = torch.arange(8) != unused
+    wanted = rasterize((pixels[rest], depth[rest], weights[rest]), kind)
+    for spoilt, value in ((pixels, torch.nan), (depth, torch.inf), (weights, torch.nan)):
+        spoilt[unused] = value
+        inputs = [tensor.clone().requires_grad_() for tensor in (pixels, depth, weights)]
+        reduce, splat = kind
+        found = rasterize_depth(
+            inputs[0],
+            inputs[1],
+            image_size=SIZE,
+            weights=inputs[2],
+            mask=rest,
+            reduce=reduce,  # type: ignore[arg-type]
+            splat=splat,  # type: ignore[arg-type]
+        )
+        assert_close(found.depth, wanted.depth, rtol=0, atol=1e-12)
+        unmasked = rasterize((inputs[0], inputs[1], inputs[2]), kind)
+        assert_close(unmasked.weight, wanted.weight, rtol=0, atol=1e-12)
+        total = unmasked.depth.sum() + unmasked.weight.sum()
+        for gradient in torch.autograd.grad(total, inputs, allow_unused=True):
+            if gradient is not None:
+                assert gradient.isfinite().all() and (gradient[unused] == 0).all()
+
+
+@given(pixels=extreme(6, 2), depth=extreme(6), weights=extreme(6))
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_finite_input_gives_nan_or_inf(
+    kind: tuple[str, str], pixels: Tensor, depth: Tensor, weights: Tensor
+) -> None:
+    for dtype in (torch.float32, torch.float64):
+        # A depth over a weight, the gradient of a mean, must itself fit the type.
+        power = 0.25 if dtype == torch.float32 and kind[0] == "mean" else 1.0
+        inputs = [
+            value.to(dtype).requires_grad_()
+            for value in (pixels, depth.abs() ** power, weights.abs() ** power)
+        ]
+        sparse = rasterize((inputs[0], inputs[1], inputs[2]), kind)
+        assert sparse.depth.isfinite().all() and sparse.weight.isfinite().all()
+        total = sparse.depth.sum() + sparse.weight.sum()
+        for gradient in torch.autograd.grad(total, inputs, allow_unused=True):
+            assert gradient is None or gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_are_right(kind: tuple[str, str]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    pixels = 0.3 + 3 * torch.rand(6, 2, generator=generator, dtype=torch.float64)
+    depth = torch.arange(1.0, 7).double().requires_grad_()
+    weights = (0.5 + torch.rand(6, generator=generator, dtype=torch.float64)).requires_grad_()
+
+    def image(depth: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+        return tuple(rasterize((pixels, depth, weights), kind))
+
+    assert torch.autograd.gradcheck(image, (depth, weights))
+    if kind == ("mean", "bilinear"):
+
+        def moved(pixels: Tensor) -> tuple[Tensor, ...]:
+            return tuple(rasterize((pixels, depth.detach(), weights.detach()), kind))
+
+        assert torch.autograd.gradcheck(moved, (pixels.requires_grad_(),))
+
+
+def test_depths_that_float32_cannot_tell_apart_are_told_apart() -> None:
+    depth = torch.tensor([2.0 + 1e-12, 2.0]).double()
+    sparse = rasterize_depth(torch.zeros(2, 2).double(), depth, image_size=(1, 1))
+    assert sparse.depth.item() == 2.0
+
+
+def test_ties_go_to_the_first_and_it_alone_gets_the_gradient() -> None:
+    depth = torch.tensor([3.0, 2.0, 2.0], requires_grad=True)
+    weights = torch.tensor([1.0, 4.0, 5.0])
+    sparse = rasterize_depth(torch.zeros(3, 2), depth, image_size=(1, 1), weights=weights)
+    assert (sparse.depth.item(), sparse.weight.item()) == (2, 4)
+    assert torch.autograd.grad(sparse.depth.sum(), depth)[0].tolist() == [0, 1, 0]
+
+
+def test_a_pixel_owns_half_a_pixel_around_its_centre() -> None:
+    pixels = torch.tensor([[-0.5, 0.0], [0.49, 0.0], [0.5, 0.0], [-0.51, 0.0]])
+    sparse = rasterize_depth(pixels, torch.arange(1.0, 5), image_size=(1, 2))
+    assert sparse.depth.tolist() == [[[1.0, 3.0]]]

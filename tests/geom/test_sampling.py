@@ -1,0 +1,240 @@
+"""Places along segments, and feature maps read at pixels."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import (
+    Segments,
+    ShapeError,
+    epipolar_segments,
+    in_image,
+    pixel_grid,
+    project,
+    sample_inv_depths,
+    sample_map,
+    sample_segments,
+    unproject,
+)
+from deltas_geom.testing import PosedScene, forward_motion
+from deltas_geom.testing.scenes import IMAGE_SIZE
+from deltas_geom.testing.strategies import extreme, image_pixels, posed_scenes, vectors
+
+SPACINGS = ["inv_depth", "pixels"]
+
+
+def segments_of(scene: PosedScene, near: float = 0.7, far: float = 20.0) -> Segments:
+    return epipolar_segments(
+        scene.views, scene.pixels[0], depth_range=(near, far), image_size=IMAGE_SIZE
+    )
+
+
+def project_inv_depths(scene: PosedScene, inv_depth: Tensor) -> Tensor:
+    """Direct projection of the anchor's pixels at ``(V-1, N, S)`` 1/m: ``(V-1, N, S, 2)``."""
+    sources = []
+    for source, inverse in enumerate(inv_depth, start=1):
+        columns = []
+        for depth in (1 / inverse).unbind(dim=-1):
+            points = unproject(scene.views.select(0), scene.pixels[:1], depth[None])[0]
+            columns.append(project(scene.views.select(source), points).pixels[0])
+        sources.append(torch.stack(columns, dim=-2))
+    return torch.stack(sources)
+
+
+def test_wrong_arguments_are_named() -> None:
+    scene = forward_motion()
+    segments = segments_of(scene)
+    with pytest.raises(ValueError, match="num_samples must be at least 2, got 1"):
+        sample_segments(segments, 1)
+    with pytest.raises(ValueError, match="spacing must be 'inv_depth' or 'pixels', got 'depth'"):
+        sample_segments(segments, 4, spacing="depth")  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="feature_map must have shape"):
+        sample_map(torch.zeros(4, 4), torch.zeros(1, 2), image_size=(4, 4))
+    with pytest.raises(ShapeError, match="inv_depths must have shape"):
+        sample_inv_depths(scene.views, scene.pixels[0], torch.tensor(1.0), image_size=(4, 4))
+
+
+def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    keypoints = scene.pixels[0].expand(4, 1, 3, 2)
+    segments = epipolar_segments(
+        scene.views, keypoints, depth_range=(0.7, 20), image_size=IMAGE_SIZE
+    )
+    samples = sample_segments(segments, 5, offsets=(-1, 0, 1), image_size=IMAGE_SIZE)
+    assert samples.pixels.shape == (4, 1, 1, 3, 3, 5, 2) and samples.pixels.dtype == dtype
+    assert samples.inv_depth.shape == (4, 1, 1, 3, 5) and samples.mask.shape == (4, 1, 1, 3, 3, 5)
+    for inv_depths in (torch.rand(5, dtype=dtype), torch.rand(4, 1, 3, 5, dtype=dtype)):
+        common = sample_inv_depths(scene.views, keypoints, inv_depths, image_size=IMAGE_SIZE)
+        assert common.pixels.shape == (4, 1, 1, 3, 1, 5, 2)
+        assert common.inv_depth.shape == (4, 1, 1, 3, 5)
+    read = sample_map(torch.rand(4, 1, 7, 6, 8, dtype=dtype), keypoints, image_size=IMAGE_SIZE)
+    assert read.shape == (4, 1, 3, 7) and read.dtype == dtype
+
+
+def test_no_keypoints_are_no_error() -> None:
+    assert sample_map(torch.zeros(2, 7, 4, 4), torch.zeros(0, 2), image_size=(4, 4)).shape == (
+        2,
+        0,
+        7,
+    )
+
+
+@given(scene=posed_scenes(num_views=3))
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_samples_agree_with_direct_projection_at_their_inverse_depths(
+    spacing: str, scene: PosedScene
+) -> None:
+    segments = segments_of(scene)
+    samples = sample_segments(segments, 5, spacing=spacing)  # type: ignore[arg-type]
+    wanted = project_inv_depths(scene, samples.inv_depth.clamp(min=0.05))
+    offset = torch.where(samples.mask[..., 0, :, None], samples.pixels.squeeze(-3) - wanted, 0.0)
+    assert_close(offset, torch.zeros_like(offset), rtol=0, atol=1e-6)  # px
+
+
+@given(scene=posed_scenes(num_views=3))
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_samples_run_evenly_from_far_to_near(spacing: str, scene: PosedScene) -> None:
+    segments = segments_of(scene)
+    samples = sample_segments(segments, 6, spacing=spacing)  # type: ignore[arg-type]
+    steps = samples.inv_depth.diff(dim=-1)
+    assert ((steps > 0) | ~segments.visible[..., None]).all()
+    assert_close(samples.pixels[..., 0, 0, :], segments.start, rtol=0, atol=0)
+    assert_close(samples.pixels[..., 0, -1, :], segments.end, rtol=0, atol=1e-9)  # px
+    assert_close(samples.inv_depth[..., -1], segments.inv_depth_end, rtol=1e-12, atol=0)
+    if spacing == "pixels":
+        steps = samples.pixels.squeeze(-3).diff(dim=-2).norm(dim=-1)
+    assert_close(steps, steps[..., :1].expand_as(steps), rtol=1e-6, atol=1e-9)
+
+
+@given(scene=posed_scenes(), inverse=vectors(1, within=0.5, size=4))
+def test_common_inverse_depths_agree_with_projection(scene: PosedScene, inverse: Tensor) -> None:
+    inv_depths = 0.6 + inverse[0]  # 1/m
+    samples = sample_inv_depths(scene.views, scene.pixels[0], inv_depths, image_size=IMAGE_SIZE)
+    wanted = project_inv_depths(scene, samples.inv_depth)
+    assert_close(samples.pixels.squeeze(-3), wanted, rtol=0, atol=1e-8)  # px
+    assert (samples.mask.squeeze(-2) == in_image(wanted, image_size=IMAGE_SIZE)).all()
+
+
+@given(scene=posed_scenes())
+def test_infinity_is_a_sample_like_others(scene: PosedScene) -> None:
+    inv_depths = torch.tensor([0.0, 1e-9]).double()
+    samples = sample_inv_depths(scene.views, scene.pixels[0], inv_depths, image_size=IMAGE_SIZE)
+    infinity, far = samples.pixels.squeeze(-3).unbind(dim=-2)
+    assert_close(infinity, far, rtol=0, atol=1e-5)  # px
+
+
+@given(scene=posed_scenes(), offset=st.floats(-3, 3))
+def test_offset_lines_are_parallel_at_their_distance(scene: PosedScene, offset: float) -> None:
+    samples = sample_segments(segments_of(scene), 4, offsets=(0, offset))
+    beside = samples.pixels[..., 1, :, :] - samples.pixels[..., 0, :, :]
+    distance = torch.where(samples.mask[..., 0, :], beside.norm(dim=-1), abs(offset))
+    assert_close(distance, torch.full_like(distance, abs(offset)), rtol=0, atol=1e-9)  # px
+
+
+def test_offset_samples_beyond_the_image_are_masked() -> None:
+    segments = segments_of(forward_motion())
+    samples = sample_segments(segments, 9, offsets=(-600, 0), image_size=IMAGE_SIZE)
+    assert (samples.mask == in_image(samples.pixels, image_size=IMAGE_SIZE)).all()
+    assert not samples.mask[..., 0, :].any() and samples.mask[..., 1, 1:-1].all()
+
+
+@given(
+    pixels=image_pixels(5, image_size=(24, 32)),
+    slope=vectors(1, within=1.0),
+    stride=st.sampled_from([1, 2, 4, 8]),
+)
+def test_a_linear_field_is_sampled_exactly(pixels: Tensor, slope: Tensor, stride: int) -> None:
+    size = (24 // stride, 32 // stride)
+    places = (pixel_grid(size, dtype=torch.float64) + 0.5) * stride - 0.5
+    field = (places @ slope[0, :2] + slope[0, 2]).reshape(1, *size)
+    # Between the centres of the outer cells; beyond them the border continues.
+    low, high = places.amin(dim=0), places.amax(dim=0)
+    inner = torch.minimum(torch.maximum(pixels, low), high)
+    read = sample_map(field, pixels, image_size=(24, 32))[:, 0]
+    assert_close(read, inner @ slope[0, :2] + slope[0, 2], rtol=0, atol=1e-12)
+
+
+@given(pixels=extreme(4, 2))
+def test_no_finite_pixel_reads_nan_or_inf(pixels: Tensor) -> None:
+    for dtype in (torch.float32, torch.float64):
+        features = torch.rand(3, 4, 4, dtype=dtype, requires_grad=True)
+        keypoints = pixels.to(dtype).requires_grad_()
+        read = sample_map(features, keypoints, image_size=(16, 16))
+        assert read.isfinite().all()
+        for gradient in torch.autograd.grad(read.sum(), (features, keypoints)):
+            assert gradient.isfinite().all()
+
+
+@given(pixels=extreme(3, 2), inv_depths=extreme(4))
+def test_no_finite_inverse_depth_gives_nan_or_inf(pixels: Tensor, inv_depths: Tensor) -> None:
+    for dtype in (torch.float32, torch.float64):
+        views = forward_motion(dtype=dtype).views
+        keypoints = pixels.to(dtype).requires_grad_()
+        inverse = inv_depths.abs().to(dtype).requires_grad_()
+        samples = sample_inv_depths(views, keypoints, inverse, image_size=IMAGE_SIZE)
+        assert samples.pixels.isfinite().all()
+        for gradient in torch.autograd.grad(samples.pixels.sum(), (keypoints, inverse)):
+            assert gradient.isfinite().all()
+
+
+@given(scene=posed_scenes())
+def test_float32_is_within_its_bound_of_float64(scene: PosedScene) -> None:
+    single = scene._replace(views=scene.views.to(torch.float32), pixels=scene.pixels.float())
+    inv_depths = torch.tensor([0.0, 0.2, 0.5])
+    found = sample_inv_depths(single.views, single.pixels[0], inv_depths, image_size=IMAGE_SIZE)
+    exact = sample_inv_depths(
+        scene.views, scene.pixels[0], inv_depths.double(), image_size=IMAGE_SIZE
+    )
+    # 32 roundings of terms up to 1000 px.
+    assert_close(found.pixels.double(), exact.pixels, rtol=0, atol=32 * 6e-8 * 1000)  # px
+
+
+def test_gradients_are_right() -> None:
+    scene = forward_motion()
+    keypoints = scene.pixels[0].clone().requires_grad_()
+
+    def along(keypoints: Tensor) -> Tensor:
+        found = epipolar_segments(
+            scene.views, keypoints, depth_range=(0.7, 10), image_size=IMAGE_SIZE
+        )
+        by_depth = sample_segments(found, 3, offsets=(0, 1)).pixels
+        return by_depth + sample_segments(found, 3, spacing="pixels", offsets=(0, 1)).pixels
+
+    def common(keypoints: Tensor, inv_depths: Tensor) -> Tensor:
+        return sample_inv_depths(scene.views, keypoints, inv_depths, image_size=IMAGE_SIZE).pixels
+
+    inv_depths = torch.tensor([0.0, 0.3, 0.8]).double().requires_grad_()
+    features = torch.rand(2, 4, 5, dtype=torch.float64, requires_grad=True)
+    places = torch.tensor([[2.2, 3.1], [5.7, 4.4]]).double().requires_grad_()
+
+    def read(features: Tensor, places: Tensor) -> Tensor:
+        return sample_map(features, places, image_size=(8, 10))
+
+    assert torch.autograd.gradcheck(along, (keypoints,))
+    assert torch.autograd.gradcheck(common, (keypoints, inv_depths))
+    assert torch.autograd.gradcheck(read, (features, places))
+
+
+def test_samples_behind_the_source_or_of_a_nan_keypoint_are_masked_without_gradient() -> None:
+    views = forward_motion().views  # the source stands 0.5 m ahead
+    keypoints = torch.tensor([[300.0, 200.0], [torch.nan, 200.0]]).double().requires_grad_()
+    inv_depths = torch.tensor([0.1, 2.0, 4.0]).double().requires_grad_()
+    samples = sample_inv_depths(views, keypoints, inv_depths, image_size=IMAGE_SIZE)
+    assert samples.mask[0, :, 0].tolist() == [[True, False, False], [False] * 3]
+    gradient, of_keypoints = torch.autograd.grad(samples.pixels.sum(), (inv_depths, keypoints))
+    assert gradient[0] != 0 and (gradient[1:] == 0).all() and of_keypoints.isfinite().all()
+
+
+def test_an_end_near_the_cameras_plane_does_not_overshoot() -> None:
+    one = torch.ones(1, 1, dtype=torch.float64)
+    end = torch.tensor([[[100.0, 0.0]]]).double()
+    status = torch.zeros(1, 1, dtype=torch.int8)
+    for foreshortening in (1e-15, 1e15):
+        segments = Segments(0 * end, end, 0.1 * one, one, status, foreshortening * one)
+        for spacing in SPACINGS:
+            samples = sample_segments(segments, 5, spacing=spacing)  # type: ignore[arg-type]
+            assert samples.inv_depth.max() <= 1 and samples.inv_depth.min() >= 0.1
+            assert samples.inv_depth[0, 0, -1] == 1 and samples.pixels[0, 0, 0, -1, 0] == 100

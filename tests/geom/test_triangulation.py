@@ -1,0 +1,435 @@
+"""Weighted, masked n-view triangulation and the status of every point."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.geometry.epipolar import triangulate_points as kornia_triangulate
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import (
+    PosedViews,
+    ShapeError,
+    Status,
+    camera_centers,
+    point_covariance,
+    project,
+    ray_parallax,
+    reprojection_residual,
+    triangulate,
+    triangulate_points,
+)
+from deltas_geom.testing import (
+    DEGENERATE_SCENES,
+    PosedScene,
+    default_intrinsics,
+    forward_motion,
+    right_angle,
+    rigid,
+    ring,
+    scene_from,
+)
+from deltas_geom.testing.strategies import extreme, posed_scenes, scales, vectors
+
+NOISE = 0.5  # px
+NAMED_STATUS = {
+    "zero_baseline": Status.NO_PARALLAX,
+    "pure_rotation": Status.NO_PARALLAX,
+    "right_angle": Status.OK,
+    "ring": Status.OK,
+    "forward_motion": Status.OK,
+    "on_baseline": Status.NO_PARALLAX,
+    "behind_camera": Status.BEHIND_CAMERA,
+    "at_infinity": Status.AT_INFINITY,
+}
+
+
+@st.composite
+def noisy(draw: st.DrawFn, num_views: int = 3) -> tuple[PosedScene, Tensor]:
+    """A scene of four points whose pixels are off by up to NOISE, and weights of 0.2 to 1."""
+    scene = draw(posed_scenes(num_views=num_views))
+    noise = draw(vectors(num_views * 4, within=NOISE, size=2)).reshape(num_views, 4, 2)
+    weights = 0.6 + draw(vectors(num_views, within=0.4, size=4))
+    return scene._replace(pixels=scene.pixels + noise), weights
+
+
+def dlt_rows(proj: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
+    """Rows ``(N, 2V, 4)`` of one scene, as in the book."""
+    equations = pixels[..., None] * proj[:, None, 2:] - proj[:, None, :2]  # (V, N, 2, 4)
+    return (weights[..., None, None] * equations).transpose(0, 1).flatten(1, 2)
+
+
+def svd_points(proj: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
+    null = torch.linalg.svd(dlt_rows(proj, pixels, weights)).Vh[:, -1]
+    return null[:, :3] / null[:, 3:]
+
+
+def test_wrong_arguments_are_named() -> None:
+    proj, pixels = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2)
+    with pytest.raises(ShapeError, match="pixels has V = 3 but proj has V = 2"):
+        triangulate(proj, torch.zeros(3, 5, 2))
+    with pytest.raises(ShapeError, match="pixels has N = 5 but weights has N = 4"):
+        triangulate(proj, pixels, torch.ones(2, 4))
+    with pytest.raises(ShapeError, match="pixels has V = 2 but mask has V = 1"):
+        triangulate(proj, pixels, mask=torch.ones(1, 5, dtype=torch.bool))
+    with pytest.raises(ValueError, match="frame must be 'rig' or 'world', got 'rigid'"):
+        triangulate(proj, pixels, frame="rigid")  # type: ignore[arg-type]
+
+
+def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    pixels = scene.pixels.expand(4, 1, 2, 3, 2)
+    weights = torch.ones(5, 2, 3, dtype=dtype)
+    result = triangulate(scene.views.proj, pixels, weights, covariance=True)
+    assert result.points.shape == (4, 5, 3, 3) and result.points.dtype == dtype
+    assert result.depth.shape == (4, 5, 2, 3) and result.status.dtype == torch.int8
+    assert result.status.shape == result.residual.shape == result.parallax.shape == (4, 5, 3)
+    assert result.covariance is not None and result.covariance.shape == (4, 5, 3, 3, 3)
+    many = triangulate(scene.views.proj.expand(6, 2, 3, 4), scene.pixels)
+    assert many.points.shape == (6, 3, 3)
+    assert_close(many.points[5], triangulate_points(scene.views.proj, scene.pixels))
+
+
+def test_no_points_and_a_single_view_are_no_error() -> None:
+    proj = forward_motion().views.proj
+    assert triangulate(proj, torch.zeros(2, 0, 2).double(), covariance=True).points.shape == (0, 3)
+    alone = triangulate(proj[:1], torch.zeros(1, 4, 2).double())
+    assert (alone.status == Status.TOO_FEW_VIEWS).all()
+
+
+@given(scene=posed_scenes(num_views=3))
+@pytest.mark.parametrize("frame", ["rig", "world"])
+def test_without_noise_triangulation_is_exact(frame: str, scene: PosedScene) -> None:
+    result = triangulate(scene.views.proj, scene.pixels, frame=frame)  # type: ignore[arg-type]
+    assert result.valid.all()
+    assert_close(result.points, scene.points, rtol=0, atol=1e-9)  # m
+    assert_close(result.depth, project(scene.views, scene.points).depth, rtol=0, atol=1e-9)
+    assert (result.residual < 1e-7).all()  # px
+
+
+@given(
+    drawn=noisy(),
+    turn=vectors(1, within=3.0),
+    shift=vectors(1, within=10.0),
+    scale=scales(decades=2),
+)
+def test_points_move_with_the_world(
+    drawn: tuple[PosedScene, Tensor], turn: Tensor, shift: Tensor, scale: float
+) -> None:
+    scene, weights = drawn
+    new_from_world = rigid(turn, shift)[0]
+    rotation, translation = new_from_world[:3, :3], new_from_world[:3, 3]
+    cam_from_new = scene.views.cam_from_world @ torch.linalg.inv(new_from_world)
+    cam_from_new[:, :3, 3] *= scale
+    proj = PosedViews(scene.views.K, cam_from_new).proj
+    points = triangulate_points(scene.views.proj, scene.pixels, weights)
+    moved = triangulate_points(proj, scene.pixels, weights)
+    wanted = scale * (points @ rotation.mT + translation)
+    assert_close(moved, wanted, rtol=0, atol=1e-8 * scale)  # 10 nm in the old unit
+
+
+@given(drawn=noisy(), left=st.integers(-99, 99), top=st.integers(-99, 99))
+def test_points_do_not_know_that_the_images_were_cropped_and_resized(
+    drawn: tuple[PosedScene, Tensor], left: int, top: int
+) -> None:
+    scene, weights = drawn
+    views = scene.views.crop(left=left, top=top).resize(old_size=(480, 640), new_size=(240, 320))
+    pixels = (scene.pixels - torch.tensor([left, top]) + 0.5) / 2 - 0.5
+    assert_close(
+        triangulate_points(views.proj, pixels, weights),
+        triangulate_points(scene.views.proj, scene.pixels, weights),
+        rtol=0,
+        atol=1e-9,  # m
+    )
+
+
+@given(drawn=noisy(), factor=scales(decades=100))
+def test_only_the_ratios_of_weights_count(drawn: tuple[PosedScene, Tensor], factor: float) -> None:
+    scene, weights = drawn
+    result = triangulate(scene.views.proj, scene.pixels, weights)
+    scaled = triangulate(scene.views.proj, scene.pixels, factor * weights)
+    assert_close(scaled.points, result.points, rtol=0, atol=1e-10)  # m
+    assert_close(scaled.residual, result.residual, rtol=0, atol=1e-9)  # px
+
+
+@given(drawn=noisy(), order=st.permutations([0, 1, 2]))
+def test_the_order_of_views_does_not_count(
+    drawn: tuple[PosedScene, Tensor], order: list[int]
+) -> None:
+    scene, weights = drawn
+    result = triangulate(scene.views.proj, scene.pixels, weights)
+    other = triangulate(scene.views.proj[order], scene.pixels[order], weights[order])
+    assert_close(other.points, result.points, rtol=0, atol=1e-10)  # m
+    assert_close(other.depth, result.depth[order], rtol=0, atol=1e-10)
+
+
+@given(drawn=noisy(), view=st.integers(0, 2), by_mask=st.booleans(), spoil=st.booleans())
+def test_a_view_that_is_masked_or_of_weight_0_is_a_view_removed(
+    drawn: tuple[PosedScene, Tensor], view: int, by_mask: bool, spoil: bool
+) -> None:
+    scene, weights = drawn
+    rest = [other for other in range(3) if other != view]
+    wanted = triangulate(scene.views.proj[rest], scene.pixels[rest], weights[rest], covariance=True)
+    pixels, proj = scene.pixels.clone(), scene.views.proj.clone()
+    pixels[view] = torch.nan
+    if spoil:
+        proj[view] = torch.nan
+    mask = torch.ones(3, 4, dtype=torch.bool)
+    if by_mask:
+        mask[view] = False
+    else:
+        weights = weights.clone()
+        weights[view] = 0
+    result = triangulate(proj, pixels, weights, mask, covariance=True)
+    assert_close(result.points, wanted.points, rtol=0, atol=1e-10)  # m
+    assert (result.status == wanted.status).all()
+    assert_close(result.residual, wanted.residual, rtol=0, atol=1e-9)  # px
+    assert_close(result.parallax, wanted.parallax, rtol=0, atol=1e-12)  # rad
+    assert_close(result.covariance, wanted.covariance, rtol=1e-9, atol=1e-12)  # m^2
+    assert_close(result.depth[rest], wanted.depth, rtol=0, atol=1e-10)
+
+
+@given(drawn=noisy(), far=scales(decades=9))
+def test_a_masked_camera_may_stand_anywhere(drawn: tuple[PosedScene, Tensor], far: float) -> None:
+    scene, weights = drawn
+    proj = scene.views.proj.clone()
+    proj[2, :, 3] = far * proj[2, :, :3].sum(dim=-1)
+    mask = torch.tensor([True, True, False])[:, None].expand(3, 4)
+    for dtype in (torch.float32, torch.float64):
+        inputs = proj.to(dtype), scene.pixels.to(dtype), weights.to(dtype)
+        wanted = triangulate(*(value[:2] for value in inputs))
+        result = triangulate(*inputs, mask)
+        assert (result.status == wanted.status).all()
+        assert_close(result.points, wanted.points, rtol=1e-6, atol=1e-6)  # m
+
+
+@given(drawn=noisy(), view=st.integers(0, 2))
+def test_a_doubled_view_is_a_doubled_squared_weight(
+    drawn: tuple[PosedScene, Tensor], view: int
+) -> None:
+    scene, weights = drawn
+    twice = [0, 1, 2, view]
+    doubled = triangulate_points(scene.views.proj[twice], scene.pixels[twice], weights[twice])
+    weights = weights.clone()
+    weights[view] *= 2**0.5
+    heavier = triangulate_points(scene.views.proj, scene.pixels, weights)
+    assert_close(doubled, heavier, rtol=0, atol=1e-10)  # m
+
+
+@given(drawn=noisy(), view=st.integers(0, 2))
+def test_a_masked_view_and_a_failed_point_get_no_gradient(
+    drawn: tuple[PosedScene, Tensor], view: int
+) -> None:
+    scene, weights = drawn
+    mask = torch.ones(3, 4, dtype=torch.bool)
+    mask[view, :2] = False
+    pixels = scene.pixels.clone()
+    pixels[view, 0] = torch.nan  # masked: harmless
+    pixels[0 if view else 1, 3] = torch.inf  # used: the point fails
+    inputs = [value.clone().requires_grad_() for value in (scene.views.proj, pixels, weights)]
+    result = triangulate(*inputs, mask, covariance=True)
+    assert result.status[3] == Status.NOT_FINITE_INPUT and (result.points[3] == 0).all()
+    total = result.points.sum() + result.depth.sum() + result.residual.sum()
+    of_proj, of_pixels, of_weights = torch.autograd.grad(total, inputs)
+    assert of_proj.isfinite().all()
+    for gradient in (of_pixels, of_weights):
+        assert gradient.isfinite().all()
+        assert (gradient[view, :2] == 0).all() and (gradient[:, 3] == 0).all()
+        assert (gradient[:, 2] != 0).any()
+
+
+@given(drawn=noisy(), view=st.integers(0, 2))
+def test_status_tells_the_truth(drawn: tuple[PosedScene, Tensor], view: int) -> None:
+    scene, weights = drawn
+    weights = weights.clone()
+    weights[:, 1] = 0
+    weights[view, 1] = 1  # one view alone
+    weights[:, 2] *= torch.where(torch.arange(3) == view, 1.0, 1e-12)  # as good as alone
+    result = triangulate(scene.views.proj, scene.pixels, weights)
+    wanted = [Status.OK, Status.TOO_FEW_VIEWS, Status.TOO_FEW_VIEWS, Status.OK]
+    assert result.status.tolist() == wanted
+    assert (result.valid == (result.status == Status.OK)).all()
+    # The other cameras' pixels, mirrored through the centre, meet behind every camera.
+    behind = scene._replace(points=2 * camera_centers(scene.views.cam_from_world)[0] - scene.points)
+    homogeneous = (
+        torch.cat([behind.points, torch.ones(4, 1).double()], dim=-1) @ scene.views.proj.mT
+    )
+    pixels = homogeneous[..., :2] / homogeneous[..., 2:]
+    assert (triangulate(scene.views.proj, pixels).status == Status.BEHIND_CAMERA).all()
+
+
+@given(drawn=noisy())
+def test_float32_is_within_its_bound_of_float64(drawn: tuple[PosedScene, Tensor]) -> None:
+    scene, weights = drawn
+    inputs = [value.float() for value in (scene.views.proj, scene.pixels, weights)]
+    single = triangulate_points(*inputs)
+    exact = triangulate_points(*(value.double() for value in inputs))
+    # Solved in float64 either way: only the result is rounded, at 5 m.
+    assert_close(single.double(), exact, rtol=0, atol=6e-8 * 8)  # m
+
+
+@given(pixels=extreme(3, 4, 2), weights=extreme(3, 4), proj=extreme(3, 3, 4), wild=st.booleans())
+def test_no_finite_input_gives_nan_or_inf(
+    pixels: Tensor, weights: Tensor, proj: Tensor, wild: bool
+) -> None:
+    rig = ring().views.proj[:3]
+    for dtype in (torch.float32, torch.float64):
+        cameras = (proj if wild else rig).to(dtype).requires_grad_()
+        places = pixels.to(dtype).requires_grad_()
+        # Products of the gradient with a weight of 1e-30 do not fit float32.
+        shares = (weights.abs() ** (0.25 if dtype == torch.float32 else 1)).to(dtype)
+        shares.requires_grad_()
+        result = triangulate(cameras, places, shares, covariance=True)
+        for value in result:
+            assert value is not None and value.isfinite().all()
+        total = result.points.sum() + result.depth.sum() + result.residual.sum()
+        gradients = torch.autograd.grad(total, (places, shares, cameras))
+        for gradient in gradients[: 2 if wild and dtype == torch.float32 else 3]:
+            assert gradient.isfinite().all()
+
+
+@given(drawn=noisy())
+@pytest.mark.parametrize("frame", ["rig", "world"])
+def test_the_answer_is_that_of_an_svd(frame: str, drawn: tuple[PosedScene, Tensor]) -> None:
+    scene, weights = drawn
+    proj = scene.views.proj
+    ours = triangulate_points(proj, scene.pixels, weights, frame=frame)  # type: ignore[arg-type]
+    if frame == "world":
+        assert_close(ours, svd_points(proj, scene.pixels, weights), rtol=0, atol=1e-8)  # m
+        return
+    centers = camera_centers(scene.views.cam_from_world)
+    for point in range(4):
+        share = weights[:, point].square() / weights[:, point].square().sum()
+        origin = share @ centers
+        unit = (share @ (centers - origin).square().sum(dim=-1)).sqrt()
+        world_from_rig = torch.eye(4, dtype=torch.float64)
+        world_from_rig[:3] = torch.cat([unit * torch.eye(3).double(), origin[:, None]], dim=1)
+        some = slice(point, point + 1)
+        local = svd_points(proj @ world_from_rig, scene.pixels[:, some], weights[:, some])
+        assert_close(ours[some], local * unit + origin, rtol=0, atol=1e-8)  # m
+
+
+@given(drawn=noisy(num_views=2))
+def test_opencv_and_kornia_agree_in_the_worlds_frame(drawn: tuple[PosedScene, Tensor]) -> None:
+    scene, _ = drawn
+    proj, (first, second) = scene.views.proj, scene.pixels
+    ours = triangulate_points(proj, scene.pixels, frame="world")
+    by_opencv = cv2.triangulatePoints(
+        proj[0].numpy(), proj[1].numpy(), first.numpy().T, second.numpy().T
+    )
+    assert_close(ours, torch.from_numpy(by_opencv[:3] / by_opencv[3]).mT, rtol=0, atol=1e-7)  # m
+    by_kornia = kornia_triangulate(proj[:1], proj[1:], first[None], second[None])[0]
+    assert_close(ours, by_kornia, rtol=0, atol=1e-6)  # m
+
+
+def test_the_covariance_is_what_monte_carlo_finds() -> None:
+    generator = torch.Generator().manual_seed(0)
+    pose = torch.eye(4).double().repeat(3, 1, 1)
+    pose[:, 0, 3] = torch.tensor([0.0, -0.3, -0.6])
+    views = PosedViews(default_intrinsics().expand(3, 3, 3), pose)
+    scene = scene_from(views, torch.tensor([[0.3, 0.2, 3.0], [-0.4, 0.1, 4.0]]).double())
+    weights = torch.tensor([[2.0], [4.0], [3.0]]).double().expand(3, 2)  # 1 / px
+    noise = torch.randn(4000, 3, 2, 2, generator=generator, dtype=torch.float64)
+    pixels = scene.pixels + noise / weights[..., None]
+    points = triangulate_points(views.proj, pixels, weights.expand(4000, 3, 2))
+    stated = triangulate(views.proj, scene.pixels, weights, covariance=True).covariance
+    assert stated is not None
+    for point in range(2):
+        whitened = torch.linalg.cholesky(stated[point]).inverse() @ points[:, point].mT
+        measured = torch.cov(whitened)
+        # 4000 trials: an entry's own deviation is 1 / sqrt(2000) = 2 %.
+        assert_close(measured, torch.eye(3).double(), rtol=0, atol=0.1)
+
+
+def test_what_is_known_of_given_points() -> None:
+    scene = right_angle()
+    used = torch.ones(2, 1, dtype=torch.bool)
+    angle = ray_parallax(scene.views.proj, scene.points, used)
+    assert_close(angle, torch.tensor([torch.pi / 2]).double())
+    beside = scene.pixels + torch.tensor([[[3.0, 4.0]], [[0.0, 0.0]]])
+    weights = torch.tensor([[3.0], [4.0]]).double()
+    residual = reprojection_residual(scene.views.proj, scene.points, beside, weights)
+    assert_close(residual, torch.tensor([3.0]).double())  # sqrt(9 * 25 / 25) px
+    lone = point_covariance(scene.views.proj, scene.points, weights * torch.tensor([[1.0], [0]]))
+    assert (lone == 0).all()
+
+
+@pytest.mark.parametrize("frame", ["rig", "world"])
+@pytest.mark.parametrize(
+    "scene", [forward_motion(), right_angle(), ring()], ids=["fwd", "90", "ring"]
+)
+def test_gradients_are_right_where_svds_are_nan_too(scene: PosedScene, frame: str) -> None:
+    inputs = tuple(
+        value.clone().requires_grad_()
+        for value in (scene.views.proj, scene.pixels, torch.ones_like(scene.pixels[..., 0]))
+    )
+
+    def solve(proj: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
+        return triangulate_points(proj, pixels, weights, frame=frame)  # type: ignore[arg-type]
+
+    # Entries of proj are in px: a coarser step keeps rounding below the tolerance.
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-6)
+
+
+def test_second_derivatives_are_right_off_the_ties() -> None:
+    scene = right_angle()
+
+    def solve(pixels: Tensor) -> Tensor:
+        return triangulate_points(scene.views.proj, pixels)
+
+    pixels = (scene.pixels + torch.tensor([3.0, -2.0])).requires_grad_()
+    assert torch.autograd.gradgradcheck(solve, (pixels,), eps=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("scene", [right_angle(), ring()], ids=["90 degrees", "ring"])
+def test_at_exact_ties_svd_has_no_gradient(scene: PosedScene) -> None:
+    pixels = scene.pixels.clone().requires_grad_()
+    weights = torch.ones_like(scene.pixels[..., 0])
+    by_svd = torch.autograd.grad(svd_points(scene.views.proj, pixels, weights).sum(), pixels)[0]
+    assert by_svd.isnan().any()
+    ours = torch.autograd.grad(triangulate_points(scene.views.proj, pixels).sum(), pixels)[0]
+    assert ours.isfinite().all() and (ours != 0).any()
+
+
+@pytest.mark.parametrize("name", DEGENERATE_SCENES)
+def test_named_scenes_have_their_status_and_finite_gradients(name: str, dtype: torch.dtype) -> None:
+    scene = DEGENERATE_SCENES[name](dtype=dtype)
+    proj, pixels = scene.views.proj.requires_grad_(), scene.pixels.clone().requires_grad_()
+    result = triangulate(proj, pixels, covariance=True)
+    assert (result.status == NAMED_STATUS[name]).all()
+    gradients = torch.autograd.grad(result.points.sum() + result.residual.sum(), (proj, pixels))
+    for value in (*result, *gradients):
+        assert value is not None and value.isfinite().all()
+    if NAMED_STATUS[name] == Status.OK:
+        assert_close(result.points, scene.points, rtol=1e-5, atol=1e-5)  # m
+    else:
+        assert (result.points == 0).all() and (result.depth == 0).all()
+        assert all((gradient == 0).all() for gradient in gradients)
+
+
+def test_a_singular_camera_that_is_masked_spoils_no_gradient() -> None:
+    scene = ring()
+    proj = scene.views.proj.clone()
+    proj[3] = 0
+    proj.requires_grad_()
+    mask = torch.tensor([True, True, True, False])[:, None]
+    points = triangulate_points(proj, scene.pixels, mask=mask)
+    assert_close(points, scene.points, rtol=0, atol=1e-12)  # m
+    assert torch.autograd.grad(points.sum(), proj)[0].isfinite().all()
+
+
+def test_unequal_weights_do_not_send_a_near_point_to_infinity(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    weights = torch.tensor([[1.0], [1e-5]], dtype=dtype).expand(2, 3)
+    result = triangulate(scene.views.proj, scene.pixels, weights)
+    assert (result.status == Status.OK).all()
+    assert_close(result.points, scene.points, rtol=0, atol=1e-4)  # m
+
+
+def test_every_status_explains_itself() -> None:
+    for status in Status:
+        assert len(status.explanation.split()) >= 4
+    assert np.unique([status.explanation for status in Status]).size == len(Status)
