@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_shapes
-from deltas_geom.homogeneous import to_homogeneous
+from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
 from deltas_geom.views import PosedViews
 
@@ -74,13 +74,15 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     """
     check_shapes(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
     lines = to_homogeneous(pixels) @ fundamental.mT
-    squared = lines[..., :2].square().sum(dim=-1, keepdim=True)
+    size = lines[..., :2].detach().abs().amax(dim=-1, keepdim=True)
     scale = to_homogeneous(pixels).abs() @ fundamental[..., :2, :].abs().mT
     noise = 16 * torch.finfo(lines.dtype).eps * scale.amax(dim=-1, keepdim=True)
-    has_line = squared > noise.square()
-    # Double where: the unused branch must not turn the gradient into NaN.
-    safe = torch.where(has_line, squared, 1.0)
-    return torch.where(has_line, lines * safe.rsqrt(), 0.0)
+    has_line = size > noise
+    # Divided by its size first, as the square of a short normal, to the power -3/2 in the
+    # gradient, leaves the range of float32. Double where: no NaN from the unused branch.
+    lines = safe_divide(lines, size, has_line)
+    squared = lines[..., :2].square().sum(dim=-1, keepdim=True)
+    return lines * torch.where(has_line, squared, 1.0).rsqrt()
 
 
 def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Tensor:

@@ -82,7 +82,7 @@ def correlate(
         samples=(samples.pixels, "S N O M 2"),
     )
     batch = batch_shape(
-        descriptors.shape[:-2] + (1,), feature_map.shape[:-3], samples.pixels.shape[:-4]
+        (*descriptors.shape[:-2], 1), feature_map.shape[:-3], samples.pixels.shape[:-4]
     )
     height, width = feature_map.shape[-2:]
     features = feature_map.flatten(-2)
@@ -122,7 +122,8 @@ def soft_argmax(
     Source: the paper, equations 2 and 3.
 
     Example:
-        >>> soft_argmax(torch.tensor([0.0, 50.0, 0.0]), torch.tensor([[1.0], [2.0], [3.0]])).position
+        >>> logits = torch.tensor([0.0, 50.0, 0.0])
+        >>> soft_argmax(logits, torch.tensor([[1.0], [2.0], [3.0]])).position
         tensor([2.])
     """
     check_shapes(logits=(logits, "S"), positions=(positions, "S D"))

@@ -7,8 +7,8 @@ class Status(IntEnum):
     """Outcome of one point or one segment; stored as int8 tensors.
 
     Example:
-        >>> print(Status.NO_PARALLAX.explanation)
-        the used cameras are in line with the point, so depth cannot be seen: add a view from elsewhere
+        >>> print(Status.BEHIND_CAMERA.explanation)
+        the rays meet behind a used camera: a match is wrong, or a pose is inverted
     """
 
     OK = 0

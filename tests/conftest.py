@@ -11,6 +11,8 @@ settings.register_profile(
     "local", deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
+# For a night, or after a change to the numerics: pytest --hypothesis-profile=thorough
+settings.register_profile("thorough", settings.get_profile("local"), max_examples=1000)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 

@@ -54,6 +54,7 @@ def fit(
     *,
     checkpoint_every: int = 200,
     validate_every: int = 500,
+    stop: int | None = None,
     report: Callable[[str], None] = print,
 ) -> Path:
     """Train a network.
@@ -65,6 +66,7 @@ def fit(
         start: what to start from.
         checkpoint_every: steps between checkpoints.
         validate_every: steps between evaluations on held-out rooms.
+        stop: end after this step, to be resumed later; the schedule stays that of the config.
         report: where messages go.
 
     Returns:
@@ -79,8 +81,8 @@ def fit(
     model, optimizer = fabric.setup(state.model, state.optimizer)
     maker = BatchMaker(config)
     folder.mkdir(parents=True, exist_ok=True)
-    step = state.step
-    loader = room_loader(config, start=step, stop=config.steps)
+    step, last = state.step, min(config.steps, stop or config.steps)
+    loader = room_loader(config, start=step, stop=last)
     with _progress() as progress, (folder / "log.jsonl").open("a") as log:
         bar = progress.add_task("training", total=config.steps, completed=step, loss="")
         for rooms in loader:
@@ -90,7 +92,7 @@ def fit(
             losses = _step(model, optimizer, fabric.to_device(maker(rooms, step)), config, fabric)
             state.average.update(state.model, step)
             step += 1
-            if step % 20 == 0 or step == config.steps:
+            if step % 20 == 0 or step == last:
                 entry = _log_entry(step, losses, time.perf_counter() - began)
                 print(json.dumps(entry), file=log, flush=True)
                 progress.update(bar, loss=f"loss {entry['total']:.3f}")
@@ -99,10 +101,10 @@ def fit(
                         f"training diverged at step {step}", folder, "lower --learning-rate"
                     )
             progress.update(bar, completed=step)
-            if step % checkpoint_every == 0 or step == config.steps:
+            if step % checkpoint_every == 0 or step == last:
                 save_run(folder, config, state._replace(step=step), origin=origin)
-            if step % validate_every == 0 or step == config.steps:
-                validation = validate(state.average.model, config)
+            if step % validate_every == 0 or step == last:
+                validation = validate(state.average.model)
                 print(json.dumps({"step": step, "validation": validation}), file=log, flush=True)
                 report(f"step {step}: held-out rooms {_in_words(validation)}")
     return folder / "weights.safetensors"
@@ -114,10 +116,14 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / config.steps)))
 
 
-def validate(model: nn.Module, config: TrainConfig) -> dict[str, float]:
-    """Depth metrics on rooms that no training sees, at three views."""
-    rooms = Rooms(12, seed=VALIDATION_SEED, num_views=3, image_size=(144, 192))
-    return evaluate_rooms(model, rooms, depth_range=DEPTH_RANGE)
+def validate(model: nn.Module) -> dict[str, float]:
+    """Depth metrics on rooms that no training sees."""
+    return evaluate_rooms(model, validation_rooms(), depth_range=DEPTH_RANGE)
+
+
+def validation_rooms() -> Rooms:
+    """Three views of rooms whose seeds no training uses."""
+    return Rooms(12, seed=VALIDATION_SEED, num_views=3, image_size=(144, 192))
 
 
 def make_optimizer(model: Deltas, config: TrainConfig) -> torch.optim.Optimizer:

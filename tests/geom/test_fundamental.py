@@ -159,3 +159,12 @@ def test_the_epipole_has_no_line_and_its_neighbour_has(dtype: torch.dtype) -> No
     lines = epipolar_lines(fundamental, pixels)
     assert (lines[0] == 0).all()
     assert_close(lines[1, :2].norm(), torch.ones((), dtype=dtype))
+
+
+def test_the_scale_of_the_matrix_is_nothing_even_where_its_square_does_not_fit() -> None:
+    fundamental = torch.tensor([[0.0, 0, 1e-26], [0, 0, 2e-26], [1e-26, 1e-26, 0]])
+    fundamental.requires_grad_()
+    lines = epipolar_lines(fundamental, torch.zeros(1, 2))
+    assert_close(lines[0, :2], torch.tensor([1.0, 2]) / 5**0.5)
+    gradient = torch.autograd.grad(lines[0, 0], fundamental)[0]
+    assert gradient.isfinite().all() and (gradient != 0).any()

