@@ -178,10 +178,15 @@ def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
         hint = hints[name]
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             value = from_dict(hint, value)
-        elif isinstance(value, list):
-            value = tuple(value)
+        else:
+            value = _as_tuples(value)
         read[name] = value
     return kind(**read)
+
+
+def _as_tuples(value: Any) -> Any:
+    """JSON's lists as the tuples they were."""
+    return tuple(_as_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 CONFIGS: dict[str, NetworkConfig] = {"deltas-small": NetworkConfig()}

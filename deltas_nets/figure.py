@@ -52,9 +52,10 @@ def draw_prediction(
     draw_depth(axes[1, 0], result.depth, "dense depth")
     draw_depth(axes[1, 1], truth, "true depth")
     error = np.ma.masked_where(~known, np.abs(result.depth - truth) / np.where(known, truth, 1))
+    errors = error.compressed()
     drawn = axes[1, 2].imshow(100 * error, cmap="magma", vmin=0, vmax=20)
     axes[1, 2].set_title(
-        f"error: mean {100 * error.mean():.1f} %, median {100 * np.median(error.compressed()):.1f} %"
+        f"error: mean {100 * errors.mean():.1f} %, median {100 * np.median(errors):.1f} %"
     )
     figure.colorbar(drawn, ax=axes[1, 2], label="relative error, %", shrink=0.8)
     ticks = np.linspace(limits[0], limits[1], 5)

@@ -13,6 +13,8 @@ settings.register_profile(
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
 # For a night, or after a change to the numerics: pytest --hypothesis-profile=thorough
 settings.register_profile("thorough", settings.get_profile("local"), max_examples=1000)
+# Test tensors are small: a second thread costs more than it brings.
+torch.set_num_threads(1)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 

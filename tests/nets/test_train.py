@@ -35,9 +35,8 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(autouse=True)
 def _small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        fit_module, "validation_rooms", lambda: Rooms(1, num_views=2, image_size=(48, 64))
-    )
+    few = Rooms(1, num_views=2, image_size=(48, 64))
+    monkeypatch.setattr(fit_module, "validation_rooms", lambda: few)
 
 
 @pytest.fixture(scope="module")
@@ -45,12 +44,21 @@ def rooms() -> PosedImages:
     return next(iter(room_loader(CONFIG, start=0, stop=1)))
 
 
+def with_batch(room: PosedImages) -> PosedImages:
+    views = PosedViews(*(tensor[None] for tensor in room.views))
+    return PosedImages(room.images[None], views, room.depth[None])
+
+
+def first_of(batch: PosedImages) -> PosedImages:
+    views = PosedViews(*(tensor[0] for tensor in batch.views))
+    return PosedImages(batch.images[0], views, batch.depth[0])
+
+
 def consistent_share(room: PosedImages) -> float:
     """Share of the anchor's pixels whose depth agrees in view 1, of those that are in it."""
-    size = (room.depth.shape[-2], room.depth.shape[-1])
-    pixels = torch.cartesian_prod(
-        torch.arange(4.0, size[1] - 4, 5), torch.arange(4.0, size[0] - 4, 5)
-    )
+    size = height, width = room.depth.shape[-2], room.depth.shape[-1]
+    columns, rows = torch.arange(4.0, width - 4, 5), torch.arange(4.0, height - 4, 5)
+    pixels = torch.cartesian_prod(columns, rows)
     depth = read_nearest(room.depth[:1], pixels[None])
     points = unproject(room.views.select(0), pixels[None], depth)[0]
     there = project(room.views.select(1), points)
@@ -112,7 +120,8 @@ def test_a_damaged_checkpoint_is_an_error(tmp_path: Path) -> None:
 
 def test_steps_see_every_room_once_an_epoch_and_continue_anywhere() -> None:
     whole = list(StepSampler(6, 2, seed=1, start=0, stop=6))
-    assert sorted(sum(whole[:3], [])) == sorted(sum(whole[3:], [])) == list(range(6))
+    for epoch in (whole[:3], whole[3:]):
+        assert sorted(room for batch in epoch for room in batch) == list(range(6))
     assert whole[:3] != whole[3:]
     assert list(StepSampler(6, 2, seed=1, start=2, stop=5)) == whole[2:5]
 
@@ -129,22 +138,12 @@ def test_a_step_is_a_function_of_its_number(rooms: PosedImages) -> None:
 
 def test_mirrored_resized_and_reordered_rooms_stay_consistent() -> None:
     room = render_room(11, num_views=3, image_size=(96, 128))
-    batch = PosedImages(
-        room.images[None].float() / 255,
-        PosedViews(*(t[None] for t in room.views)),
-        room.depth[None],
-    )
-    straight = consistent_share(
-        PosedImages(batch.images[0], PosedViews(*(t[0] for t in batch.views)), batch.depth[0])
-    )
+    batch = with_batch(room._replace(images=room.images.float() / 255))
     changed = resize(mirror(batch, torch.tensor([True])), (72, 96))
     changed = choose_views(changed, 2, torch.Generator().manual_seed(0))
-    item = PosedImages(
-        changed.images[0], PosedViews(*(t[0] for t in changed.views)), changed.depth[0]
-    )
-    assert straight > 0.7
-    assert consistent_share(item) > 0.7
-    item.views.check_values()
+    assert consistent_share(room) > 0.7
+    assert consistent_share(first_of(changed)) > 0.7
+    changed.views.check_values()
 
 
 def test_mirroring_twice_changes_nothing(rooms: PosedImages) -> None:
