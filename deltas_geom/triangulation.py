@@ -61,7 +61,8 @@ def triangulate_points(
     frame: Literal["rig", "world"] = "rig",
 ) -> Tensor:
     """Points ``(*B, N, 3)`` alone; see :func:`triangulate`."""
-    return _solve(proj, pixels, weights, mask, frame)[0]
+    observed = _observe(proj, pixels, weights, mask)
+    return _judge(observed, _solve(observed, frame))[0]
 
 
 def triangulate(
@@ -102,30 +103,49 @@ def triangulate(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.0000, 2.0000]])
     """
-    points, status, used_weights, proj = _solve(proj, pixels, weights, mask, frame)
+    observed = _observe(proj, pixels, weights, mask)
+    points, status = _judge(observed, _solve(observed, frame))
     valid = status == Status.OK
-    homogeneous = to_homogeneous(points).unsqueeze(-3) @ proj.mT
+    homogeneous = to_homogeneous(points).unsqueeze(-3) @ observed.proj.mT
     depth = torch.where(valid.unsqueeze(-2), homogeneous[..., 2], 0.0)
-    used_weights = torch.where(valid.unsqueeze(-2), used_weights, 0.0)
-    safe_pixels = torch.where(used_weights[..., None] > 0, pixels, 0.0)
+    used_weights = torch.where(valid.unsqueeze(-2), observed.weights, 0.0)
     return Triangulation(
         points=points,
         depth=depth,
         status=status,
         valid=valid,
-        residual=reprojection_residual(proj, points, safe_pixels, used_weights),
-        parallax=ray_parallax(proj, points, used_weights > 0),
-        covariance=point_covariance(proj, points, used_weights) if covariance else None,
+        residual=reprojection_residual(observed.proj, points, observed.pixels, used_weights),
+        parallax=ray_parallax(observed.proj, points, used_weights > 0),
+        covariance=point_covariance(observed.proj, points, used_weights) if covariance else None,
     )
 
 
-def _solve(
-    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None, frame: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points ``(*B, N, 3)``, status ``(*B, N)``, effective weights ``(*B, V, N)``, finite proj."""
+class _Observations(NamedTuple):
+    """The inputs, broadcast, with everything unusable replaced and flagged.
+
+    Attributes:
+        proj: ``(*B, V, 3, 4)`` finite.
+        pixels: ``(*B, V, N, 2)`` finite.
+        weights: ``(*B, V, N)`` finite; 0 for unused views and unsolvable points.
+        largest: ``(*B, 1, N)`` largest weight of each point.
+        counts: ``(*B, V, N)`` the view's weight is not negligible beside the largest.
+        finite: ``(*B, N)`` everything used is finite.
+        enough: ``(*B, N)`` at least two views count.
+    """
+
+    proj: Tensor
+    pixels: Tensor
+    weights: Tensor
+    largest: Tensor
+    counts: Tensor
+    finite: Tensor
+    enough: Tensor
+
+
+def _observe(
+    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> _Observations:
     check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
-    if frame not in ("rig", "world"):
-        raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
     weight = torch.ones_like(pixels[..., 0])
     if weights is not None:
         check_shapes(weights=(weights, "V N"), pixels=(pixels, "V N 2"))
@@ -140,27 +160,45 @@ def _solve(
     used = weight != 0  # NaN counts as used, and is caught as not finite
     finite_proj = proj.isfinite().all(-1).all(-1)[..., None]
     finite = ((pixels.isfinite().all(dim=-1) & weight.isfinite() & finite_proj) | ~used).all(-2)
-    # Double where throughout: what is not used must pass no gradient and no NaN.
     largest = torch.where(used, weight.detach().abs(), 0.0).amax(dim=-2, keepdim=True)
     counts = used & (weight.detach().abs() > _NEGLIGIBLE_WEIGHT * largest)
     enough = counts.sum(dim=-2) >= 2
     solvable = (finite & enough).unsqueeze(-2) & used
+    # Double where throughout: what is not used must pass no gradient and no NaN.
+    return _Observations(
+        proj=torch.where(finite_proj[..., None], proj, 0.0),
+        pixels=torch.where(solvable[..., None], pixels, 0.0),
+        weights=torch.where(solvable, weight, 0.0),
+        largest=torch.where(largest > 0, largest, 1.0),
+        counts=counts,
+        finite=finite,
+        enough=enough,
+    )
 
-    proj = torch.where(finite_proj[..., None], proj, 0.0)
-    eps = torch.finfo(proj.dtype).eps
-    work = solver_dtype(proj)
-    wide_proj = proj.to(work)
-    xy = torch.where(solvable[..., None], pixels, 0.0).to(work)
+
+class _Solution(NamedTuple):
+    """Points ``(*B, N, 3)`` before they are judged, and what is known of each ``(*B, N)``."""
+
+    points: Tensor
+    posed: Tensor
+    at_infinity: Tensor
+
+
+def _solve(observed: _Observations, frame: str) -> _Solution:
+    """Minimise the weighted algebraic error in float64, in the frame asked for."""
+    if frame not in ("rig", "world"):
+        raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+    work = solver_dtype(observed.proj)
+    proj = observed.proj.to(work)
     # The scale of all weights cancels; without it their squares cannot underflow.
-    share = torch.where(solvable, weight, 0.0).to(work) / torch.where(largest > 0, largest, 1.0)
-    squared = share.square()
+    squared = (observed.weights.to(work) / observed.largest).square()
 
-    centers, _ = projection_centers(wide_proj)
-    origin, unit = _shared_frame(centers.detach(), solvable.any(dim=-1))
-    moved = wide_proj[..., 3:] + wide_proj[..., :3] @ origin.unsqueeze(-2).mT
-    directions = wide_proj[..., :3].expand(*moved.shape[:-1], 3)
+    centers, _ = projection_centers(proj)
+    origin, unit = _shared_frame(centers.detach(), (observed.weights != 0).any(dim=-1))
+    moved = proj[..., 3:] + proj[..., :3] @ origin.unsqueeze(-2).mT
+    directions = proj[..., :3].expand(*moved.shape[:-1], 3)
     shared = torch.cat([directions, moved / unit[..., None, None]], dim=-1)
-    normal = _normal_matrix(shared, xy, squared)
+    normal = _normal_matrix(shared, observed.pixels.to(work), squared)
     shared_centers = (centers - origin) / unit[..., None]
     point_origin, point_unit = _point_frame(shared_centers, squared)
     if frame == "rig":
@@ -169,46 +207,50 @@ def _solve(
         normal = _change_frame(normal, -origin / unit, (1 / unit)[..., 0, None])
 
     # Centres closer together than the rounding of where they are do not differ.
-    reach = (shared_centers.detach().unsqueeze(-2) - point_origin.detach().unsqueeze(-3)).norm(
-        dim=-1
-    )
-    baseline = torch.where(counts, reach, 0.0).amax(dim=-2) * unit
-    from_world = torch.where(counts, centers.detach().norm(dim=-1)[..., None], 0.0).amax(dim=-2)
-    posed = finite & enough & (baseline > 64 * eps * from_world)
-    matrix, solvable_matrix = _made_safe(normal, posed)
+    eps = torch.finfo(observed.proj.dtype).eps
+    offsets = shared_centers.detach().unsqueeze(-2) - point_origin.detach().unsqueeze(-3)
+    baseline = torch.where(observed.counts, offsets.norm(dim=-1), 0.0).amax(dim=-2) * unit
+    from_world = centers.detach().norm(dim=-1)[..., None]
+    from_world = torch.where(observed.counts, from_world, 0.0).amax(dim=-2)
+    posed = observed.finite & observed.enough & (baseline > 64 * eps * from_world)
+    matrix, scalable = _made_safe(normal, posed)
     (x0, x1, x2, x3), simple = null_vector(matrix)
-    posed = posed & solvable_matrix & simple
+    posed = posed & scalable & simple
 
     # Far above the smallest number, so that the gradient of the division is finite.
     divisible = x3 > torch.finfo(work).tiny ** (1 / 3)
-    local = safe_divide(
-        torch.stack([x0, x1, x2], dim=-1), x3[..., None], (posed & divisible)[..., None]
-    )
+    direction = torch.stack([x0, x1, x2], dim=-1)
+    points = safe_divide(direction, x3[..., None], (posed & divisible)[..., None])
     if frame == "rig":
-        local = (local * point_unit[..., None] + point_origin) * unit[..., None] + origin
+        points = (points * point_unit[..., None] + point_origin) * unit[..., None] + origin
     rig_center = point_origin.detach() * unit[..., None] + origin
-    distance = (local.detach() - rig_center).norm(dim=-1)
+    distance = (points.detach() - rig_center).norm(dim=-1)
     at_infinity = ~divisible | (16 * eps * distance > baseline)
-    local = torch.where((posed & ~at_infinity)[..., None], local, 0.0)
+    return _Solution(
+        torch.where((posed & ~at_infinity)[..., None], points, 0.0), posed, at_infinity
+    )
 
+
+def _judge(observed: _Observations, solution: _Solution) -> tuple[Tensor, Tensor]:
+    """Points ``(*B, N, 3)`` of the inputs' dtype, 0 where they fail, and status ``(*B, N)``."""
+    found = solution.points.detach()
     # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-    depth = (to_homogeneous(local.detach()).unsqueeze(-3) @ wide_proj.detach().mT)[..., 2]
-    in_front = ((depth > 0) | ~solvable).all(dim=-2)
-    size = torch.maximum(local.detach().abs().amax(dim=-1), depth.abs().amax(dim=-2))
-    representable = size < torch.finfo(proj.dtype).max
-    ok = posed & ~at_infinity & in_front & representable
-    points = torch.where(ok[..., None], local, 0.0).to(proj.dtype)
-
-    status = torch.full_like(enough, Status.OK, dtype=torch.int8)
+    wide_proj = observed.proj.detach().to(found.dtype)
+    depth = (to_homogeneous(found).unsqueeze(-3) @ wide_proj.mT)[..., 2]
+    in_front = ((depth > 0) | (observed.weights == 0)).all(dim=-2)
+    size = torch.maximum(found.abs().amax(dim=-1), depth.abs().amax(dim=-2))
+    too_far = solution.at_infinity | (size >= torch.finfo(observed.proj.dtype).max)
+    ok = solution.posed & ~too_far & in_front
+    status = torch.full_like(observed.enough, Status.OK, dtype=torch.int8)
     for failed, reason in (
         (~in_front, Status.BEHIND_CAMERA),
-        (at_infinity | ~representable, Status.AT_INFINITY),
-        (~posed, Status.NO_PARALLAX),
-        (~enough, Status.TOO_FEW_VIEWS),
-        (~finite, Status.NOT_FINITE_INPUT),
+        (too_far, Status.AT_INFINITY),
+        (~solution.posed, Status.NO_PARALLAX),
+        (~observed.enough, Status.TOO_FEW_VIEWS),
+        (~observed.finite, Status.NOT_FINITE_INPUT),
     ):
         status = torch.where(failed, torch.full_like(status, reason), status)
-    return points, status, torch.where(solvable, weight, 0.0), proj
+    return torch.where(ok[..., None], solution.points, 0.0).to(observed.proj.dtype), status
 
 
 def _shared_frame(centers: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
