@@ -5,6 +5,8 @@ Nothing heavy is imported before a command runs, so that --help is instant.
 
 import re
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -317,21 +319,14 @@ def _encoder_file(name: str) -> Path | None:
     return file
 
 
-class _progress:
-    """A progress bar on standard output; call the value for every finished frame."""
+@contextmanager
+def _progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
+    """A progress bar on standard output; the value is called for every finished frame."""
+    from rich.progress import Progress
 
-    def __init__(self, name: str, total: int) -> None:
-        from rich.progress import Progress
-
-        self.bar = Progress()
-        self.task = self.bar.add_task(name, total=total)
-
-    def __enter__(self) -> Any:
-        self.bar.start()
-        return lambda _: self.bar.advance(self.task)
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
+    with Progress() as bar:
+        task = bar.add_task(name, total=total)
+        yield lambda _: bar.advance(task)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The state of a training run in its folder, written so that a kill at any time loses little."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,7 +52,8 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str)
         "data": f"procedural rooms {config.data.seed}..{config.data.seed + config.data.num_rooms}",
         "origin": origin,
         "licence": "Apache-2.0",
-        "train": json.dumps(to_dict(config)),
+        # Where rooms are kept is the machine's, and changes nothing.
+        "train": json.dumps(to_dict(replace(config, data=replace(config.data, cache=None)))),
     }
     save_weights(folder / WEIGHTS, average, metadata)
 

@@ -1,0 +1,86 @@
+"""Accuracy of the shipped weights on a real capture, also by an independent scorer."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from deltas_nets import cli, load_model
+from deltas_nets.data.capture import open_capture
+from deltas_nets.data.view_sets import choose_view_sets, read_view_sets
+from deltas_nets.evaluate.capture import CaptureScores, evaluate_network
+from deltas_nets.predict import PredictConfig
+
+pytestmark = pytest.mark.shared
+
+
+@pytest.fixture(scope="module")
+def hololens(shared_data: Path) -> Path:
+    return shared_data / "hololens"
+
+
+@pytest.fixture(scope="module")
+def seven_views(hololens: Path) -> CaptureScores:
+    capture = open_capture(hololens)
+    view_sets = read_view_sets(hololens / "view_sets.json", capture)
+    return evaluate_network(load_model(), capture, view_sets, PredictConfig())
+
+
+@pytest.fixture(scope="module")
+def three_views(hololens: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that `deltas depth` fills."""
+    out = tmp_path_factory.mktemp("hololens") / "out"
+    sets = hololens / "view_sets.json"
+    arguments = ["depth", hololens, "--out", out, "--view-sets", sets, "--views", 3]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["deltas", *map(str, arguments)])
+        cli.main()
+    return out
+
+
+@pytest.fixture(scope="module")
+def scores(hololens: Path, three_views: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
+    file = tmp_path_factory.mktemp("scores") / "scores.json"
+    arguments = ["evaluate", hololens, "--view-sets", hololens / "view_sets.json"]
+    arguments += ["--predictions", three_views, "--json", file]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["deltas", *map(str, arguments)])
+        cli.main()
+    metrics: dict = json.loads(file.read_text())["metrics"]
+    return metrics
+
+
+def test_three_views_are_accurate_and_complete(scores: dict) -> None:
+    assert scores["dense"]["abs_rel"] <= 0.12
+    assert scores["dense"]["delta1"] >= 0.88
+    assert scores["dense"]["coverage"] >= 0.99
+
+
+def test_seven_views_are_better(scores: dict, seven_views: CaptureScores) -> None:
+    assert seven_views.dense.abs_rel < scores["dense"]["abs_rel"]
+    assert seven_views.dense.delta1 > scores["dense"]["delta1"]
+
+
+def test_the_independent_scorer_agrees(
+    hololens: Path, three_views: Path, scores: dict, shared_data: Path
+) -> None:
+    scorer = shared_data.parent / "tools" / "score_depth.py"
+    if not scorer.is_file():
+        pytest.skip(f"needs {scorer}")
+    command = [sys.executable, scorer, hololens, three_views / "depth"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    raw = next(line for line in said.splitlines() if line.startswith("raw")).split()[1:]
+    names = ("abs_rel", "abs_diff", "sq_rel", "rmse", "rmse_log")
+    names += ("delta1", "delta2", "delta3", "coverage")
+    for name, value in zip(names, raw, strict=True):
+        assert scores["dense"][name] == pytest.approx(float(value), abs=2e-3), name
+
+
+def test_views_chosen_by_ourselves_do_as_well(hololens: Path, scores: dict) -> None:
+    capture = open_capture(hololens)
+    anchors = [views.anchor for views in read_view_sets(hololens / "view_sets.json", capture)]
+    chosen = choose_view_sets(capture, 3, anchors=anchors[::3])
+    found = evaluate_network(load_model(), capture, chosen, PredictConfig())
+    assert found.dense.abs_rel < 1.25 * scores["dense"]["abs_rel"]
