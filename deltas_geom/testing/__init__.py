@@ -1,4 +1,4 @@
-"""Scenes, hypothesis strategies and invariants, for our tests and for yours.
+"""Scenes and hypothesis strategies, for our tests and for yours.
 
 ``scenes`` needs torch alone; ``strategies`` needs hypothesis (the extra ``test``), so it is
 not imported here.

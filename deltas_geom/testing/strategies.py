@@ -11,7 +11,7 @@ try:
     from hypothesis import strategies as st
 except ImportError as error:  # pragma: no cover
     raise ImportError(
-        "deltas_geom.testing.strategies needs hypothesis: pip install 'deltas[test]'"
+        "deltas_geom.testing.strategies needs hypothesis: pip install 'deltas-depth[test]'"
     ) from error
 
 from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene, rigid, scene_from

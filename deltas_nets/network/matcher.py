@@ -87,8 +87,7 @@ class JointMatcher(nn.Module):
             1 / far, 1 / near, self.config.num_samples, device=keypoints.device
         )
         samples = sample_inv_depths(views, keypoints, inv_depths, image_size=image_size)
-        anchor = sample_map(descriptors.maps[:, 0], keypoints, image_size=image_size)
-        anchor = F.normalize(anchor, dim=-1)
+        anchor = _at_keypoints(descriptors, keypoints, image_size)
         correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
         correlation, seen = correlation.squeeze(-2), samples.mask.squeeze(-2)
         stages, fused = self._posterior(
@@ -169,8 +168,7 @@ class PerViewMatcher(nn.Module):
         samples = sample_segments(
             segments, self.config.num_samples, offsets=self.config.offsets, image_size=image_size
         )
-        anchor = sample_map(descriptors.maps[:, 0], keypoints, image_size=image_size)
-        anchor = F.normalize(anchor, dim=-1)
+        anchor = _at_keypoints(descriptors, keypoints, image_size)
         correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
         normed = self.norm(correlation.reshape(-1, 1)).view_as(correlation).relu()
         scores = normed * self.log_scale.exp()
@@ -181,6 +179,13 @@ class PerViewMatcher(nn.Module):
         )
         confidence = torch.where(matches.mask, matches.weights, 0.0)[:, 1:].amax(dim=1)
         return Matched(matches, confidence, posterior)
+
+
+def _at_keypoints(
+    descriptors: Descriptors, keypoints: Tensor, image_size: tuple[int, int]
+) -> Tensor:
+    """Unit descriptors ``(B, N, D)`` of the anchor's keypoints."""
+    return F.normalize(sample_map(descriptors.maps[:, 0], keypoints, image_size=image_size), dim=-1)
 
 
 Matcher = JointMatcher | PerViewMatcher
