@@ -61,18 +61,25 @@ def null_vector(matrix: Symmetric4) -> NullVector:
 def multiply(matrix: Symmetric4, x: Vector4) -> Vector4:
     """M x."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
-    x0, x1, x2, x3 = x
     return (
-        m00 * x0 + m01 * x1 + m02 * x2 + m03 * x3,
-        m01 * x0 + m11 * x1 + m12 * x2 + m13 * x3,
-        m02 * x0 + m12 * x1 + m22 * x2 + m23 * x3,
-        m03 * x0 + m13 * x1 + m23 * x2 + m33 * x3,
+        dot((m00, m01, m02, m03), x),
+        dot((m01, m11, m12, m13), x),
+        dot((m02, m12, m22, m23), x),
+        dot((m03, m13, m23, m33), x),
     )
 
 
 def dot(a: Vector4, b: Vector4) -> Tensor:
     """a · b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    total = a[0] * b[0]
+    for i in range(1, 4):
+        total = torch.addcmul(total, a[i], b[i])
+    return total
+
+
+def _less(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """a - b c in one pass over memory, which is what this file costs."""
+    return torch.addcmul(a, b, c, value=-1)
 
 
 def _unit(x: Vector4) -> Vector4:
@@ -89,13 +96,13 @@ def _factor(matrix: Symmetric4) -> _Factors:
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
     i0 = 1 / _nudged(m00)
     l10, l20, l30 = m01 * i0, m02 * i0, m03 * i0
-    i1 = 1 / _nudged(m11 - l10 * m01)
-    t21, t31 = m12 - l20 * m01, m13 - l30 * m01
+    i1 = 1 / _nudged(_less(m11, l10, m01))
+    t21, t31 = _less(m12, l20, m01), _less(m13, l30, m01)
     l21, l31 = t21 * i1, t31 * i1
-    i2 = 1 / _nudged(m22 - l20 * m02 - l21 * t21)
-    t32 = m23 - l30 * m02 - l31 * t21
+    i2 = 1 / _nudged(_less(_less(m22, l20, m02), l21, t21))
+    t32 = _less(_less(m23, l30, m02), l31, t21)
     l32 = t32 * i2
-    d3 = m33 - l30 * m03 - l31 * t31 - l32 * t32
+    d3 = _less(_less(_less(m33, l30, m03), l31, t31), l32, t32)
     return i0, i1, i2, d3, l10, l20, l30, l21, l31, l32
 
 
@@ -108,12 +115,12 @@ def _solve_scaled(factors: _Factors, b: Vector4) -> Vector4:
     """The last pivot times M^-1 b: the pivot that vanishes is never divided by."""
     i0, i1, i2, d3, l10, l20, l30, l21, l31, l32 = factors
     b0, b1, b2, b3 = b
-    b1 = b1 - l10 * b0
-    b2 = b2 - l20 * b0 - l21 * b1
-    z3 = b3 - l30 * b0 - l31 * b1 - l32 * b2
-    z2 = b2 * i2 * d3 - l32 * z3
-    z1 = b1 * i1 * d3 - l21 * z2 - l31 * z3
-    z0 = b0 * i0 * d3 - l10 * z1 - l20 * z2 - l30 * z3
+    b1 = _less(b1, l10, b0)
+    b2 = _less(_less(b2, l20, b0), l21, b1)
+    z3 = _less(_less(_less(b3, l30, b0), l31, b1), l32, b2)
+    z2 = _less(b2 * (i2 * d3), l32, z3)
+    z1 = _less(_less(b1 * (i1 * d3), l21, z2), l31, z3)
+    z0 = _less(_less(_less(b0 * (i0 * d3), l10, z1), l20, z2), l30, z3)
     return z0, z1, z2, z3
 
 

@@ -6,6 +6,7 @@ one, the answer does not depend on the world's origin or unit, and a masked view
 trace. Sums and solve run in float64 whatever the input, where the device has it.
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
@@ -26,6 +27,7 @@ from deltas_geom.uncertainty import (
 # A view whose weight is below this share of the point's largest counts as no view: its squared
 # weight, times a small parallax, would be lost in the rounding of the normal matrix.
 _NEGLIGIBLE_WEIGHT = 1e-6
+_CHUNK, _SMALLEST_CHUNK = 8192, 1024  # points
 _UPPER = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
 
 
@@ -61,8 +63,12 @@ def triangulate_points(
     frame: Literal["rig", "world"] = "rig",
 ) -> Tensor:
     """Points ``(*B, N, 3)`` alone; see :func:`triangulate`."""
-    observed = _observe(proj, pixels, weights, mask)
-    return _judge(observed, _solve(observed, frame))[0]
+
+    def solve(chunk: _Chunk) -> tuple[Tensor]:
+        observed = _observe(proj, *chunk)
+        return (_judge(observed, _solve(observed, frame))[0],)
+
+    return _in_chunks(solve, pixels, weights, mask, dims=(-2,))[0]
 
 
 def triangulate(
@@ -103,21 +109,67 @@ def triangulate(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.0000, 2.0000]])
     """
-    observed = _observe(proj, pixels, weights, mask)
-    points, status = _judge(observed, _solve(observed, frame))
-    valid = status == Status.OK
-    homogeneous = to_homogeneous(points).unsqueeze(-3) @ observed.proj.mT
-    depth = torch.where(valid.unsqueeze(-2), homogeneous[..., 2], 0.0)
-    used_weights = torch.where(valid.unsqueeze(-2), observed.weights, 0.0)
-    return Triangulation(
-        points=points,
-        depth=depth,
-        status=status,
-        valid=valid,
-        residual=reprojection_residual(observed.proj, points, observed.pixels, used_weights),
-        parallax=ray_parallax(observed.proj, points, used_weights > 0),
-        covariance=point_covariance(observed.proj, points, used_weights) if covariance else None,
-    )
+
+    def solve(chunk: _Chunk) -> tuple[Tensor, ...]:
+        observed = _observe(proj, *chunk)
+        points, status = _judge(observed, _solve(observed, frame))
+        valid = status == Status.OK
+        homogeneous = to_homogeneous(points).unsqueeze(-3) @ observed.proj.mT
+        depth = torch.where(valid.unsqueeze(-2), homogeneous[..., 2], 0.0)
+        used_weights = torch.where(valid.unsqueeze(-2), observed.weights, 0.0)
+        residual = reprojection_residual(observed.proj, points, observed.pixels, used_weights)
+        parallax = ray_parallax(observed.proj, points, used_weights > 0)
+        found = (points, depth, status, valid, residual, parallax)
+        if not covariance:
+            return found
+        return (*found, point_covariance(observed.proj, points, used_weights))
+
+    dims = (-2, -1, -1, -1, -1, -1, *([-3] if covariance else []))
+    found = _in_chunks(solve, pixels, weights, mask, dims=dims)
+    points, depth, status, valid, residual, parallax = found[:6]
+    uncertainty = found[6] if covariance else None
+    return Triangulation(points, depth, status, valid, residual, parallax, uncertainty)
+
+
+_Chunk = tuple[Tensor, Tensor | None, Tensor | None]
+"""Pixels, weights and mask of some of the points."""
+
+
+def _in_chunks(
+    solve: Callable[[_Chunk], tuple[Tensor, ...]],
+    pixels: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    *,
+    dims: tuple[int, ...],
+) -> tuple[Tensor, ...]:
+    """Solve some points at a time, so that what lies between stays in the cache.
+
+    Args:
+        solve: from a chunk to results.
+        pixels: ``(*B, V, N, 2)``.
+        weights: ``(*B, V, N)`` or None.
+        mask: ``(*B, V, N)`` or None.
+        dims: along which each result is put together.
+    """
+    count = pixels.shape[-2]
+    chunk = max(_SMALLEST_CHUNK, _CHUNK // max(1, pixels.shape[:-3].numel()))
+    if count <= chunk:
+        return solve((pixels, weights, mask))
+    parts = []
+    for first in range(0, count, chunk):
+        some = slice(first, first + chunk)
+        parts.append(
+            solve(
+                (
+                    pixels[..., some, :],
+                    None if weights is None else weights[..., some],
+                    None if mask is None else mask[..., some],
+                )
+            )
+        )
+    columns = zip(*parts, strict=True)
+    return tuple(torch.cat(column, dim=dim) for dim, column in zip(dims, columns, strict=True))
 
 
 class _Observations(NamedTuple):
@@ -185,7 +237,11 @@ class _Solution(NamedTuple):
 
 
 def _solve(observed: _Observations, frame: str) -> _Solution:
-    """Minimise the weighted algebraic error in float64, in the frame asked for."""
+    """Minimise the weighted algebraic error in float64, in the frame asked for.
+
+    Per-point vectors are ``(*B, 3, N)`` here: sums over a leading dim of three run over memory
+    in order, sums over a trailing one do not.
+    """
     if frame not in ("rig", "world"):
         raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
     work = solver_dtype(observed.proj)
@@ -199,17 +255,15 @@ def _solve(observed: _Observations, frame: str) -> _Solution:
     directions = proj[..., :3].expand(*moved.shape[:-1], 3)
     shared = torch.cat([directions, moved / unit[..., None, None]], dim=-1)
     normal = _normal_matrix(shared, observed.pixels.to(work), squared)
-    shared_centers = (centers - origin) / unit[..., None]
-    point_origin, point_unit = _point_frame(shared_centers, squared)
+    point = _point_frame((centers - origin) / unit[..., None], squared, observed.counts)
     if frame == "rig":
-        normal = _change_frame(normal, point_origin, point_unit)
+        normal = _change_frame(normal, point.origin, point.unit)
     else:
-        normal = _change_frame(normal, -origin / unit, (1 / unit)[..., 0, None])
+        normal = _change_frame(normal, (-origin / unit).mT, 1 / unit)
 
     # Centres closer together than the rounding of where they are do not differ.
     eps = torch.finfo(observed.proj.dtype).eps
-    offsets = shared_centers.detach().unsqueeze(-2) - point_origin.detach().unsqueeze(-3)
-    baseline = torch.where(observed.counts, offsets.norm(dim=-1), 0.0).amax(dim=-2) * unit
+    baseline = point.reach * unit
     from_world = centers.detach().norm(dim=-1)[..., None]
     from_world = torch.where(observed.counts, from_world, 0.0).amax(dim=-2)
     posed = observed.finite & observed.enough & (baseline > 64 * eps * from_world)
@@ -219,16 +273,22 @@ def _solve(observed: _Observations, frame: str) -> _Solution:
 
     # Far above the smallest number, so that the gradient of the division is finite.
     divisible = x3 > torch.finfo(work).tiny ** (1 / 3)
-    direction = torch.stack([x0, x1, x2], dim=-1)
-    points = safe_divide(direction, x3[..., None], (posed & divisible)[..., None])
+    inverse = safe_divide(torch.ones_like(x3), x3, posed & divisible)
+    points = torch.stack([x0, x1, x2], dim=-2) * inverse.unsqueeze(-2)
     if frame == "rig":
-        points = (points * point_unit[..., None] + point_origin) * unit[..., None] + origin
-    rig_center = point_origin.detach() * unit[..., None] + origin
-    distance = (points.detach() - rig_center).norm(dim=-1)
+        distance = _length(points.detach()) * point.unit.detach() * unit
+        points = (points * point.unit.unsqueeze(-2) + point.origin) * unit[..., None] + origin.mT
+    else:
+        rig_center = point.origin.detach() * unit[..., None] + origin.mT
+        distance = _length(points.detach() - rig_center)
     at_infinity = ~divisible | (16 * eps * distance > baseline)
-    return _Solution(
-        torch.where((posed & ~at_infinity)[..., None], points, 0.0), posed, at_infinity
-    )
+    points = torch.where((posed & ~at_infinity).unsqueeze(-2), points, 0.0)
+    return _Solution(points.mT, posed, at_infinity)
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """``(*B, N)`` lengths of ``(*B, 3, N)``."""
+    return vectors.square().sum(dim=-2).sqrt()
 
 
 def _judge(observed: _Observations, solution: _Solution) -> tuple[Tensor, Tensor]:
@@ -275,29 +335,44 @@ def _normal_matrix(proj: Tensor, xy: Tensor, squared: Tensor) -> Symmetric4:
 
     coefficients = torch.stack(
         [outer(p3, p3), -2 * outer(p3, p1), -2 * outer(p3, p2), outer(p1, p1) + outer(p2, p2)],
-        dim=-1,
-    )  # (*B, V, 10, 4)
+        dim=-2,
+    )  # (*B, V, 4, 10)
     x, y = xy.unbind(dim=-1)
     terms = torch.stack([(x * x + y * y) * squared, x * squared, y * squared, squared], dim=-2)
-    entries = (coefficients @ terms).sum(dim=-3)
+    entries = coefficients.flatten(-3, -2).mT @ terms.flatten(-3, -2)
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries.unbind(dim=-2)
     return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
 
 
-def _point_frame(centers: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean ``(*B, N, 3)`` of the centres and, as the unit, their spread ``(*B, N)``."""
+class _PointFrame(NamedTuple):
+    """Each point's rig frame, in the shared one.
+
+    Attributes:
+        origin: ``(*B, 3, N)`` mean of the centres, weighted by the squared weights.
+        unit: ``(*B, N)`` their spread.
+        reach: ``(*B, N)`` largest distance of a centre that counts from the origin.
+    """
+
+    origin: Tensor
+    unit: Tensor
+    reach: Tensor
+
+
+def _point_frame(centers: Tensor, squared: Tensor, counts: Tensor) -> _PointFrame:
     total = squared.sum(dim=-2)
     share = safe_divide(squared, total.unsqueeze(-2), (total > 0).unsqueeze(-2))
-    origin = share.mT @ centers
-    offsets = centers.unsqueeze(-2) - origin.unsqueeze(-3)
-    variance = (share * offsets.square().sum(dim=-1)).sum(dim=-2)
-    return origin, torch.where(variance > torch.finfo(variance.dtype).tiny, variance, 1.0).sqrt()
+    origin = centers.mT @ share
+    apart = (centers[..., None] - origin.unsqueeze(-3)).square().sum(dim=-2)  # (*B, V, N)
+    variance = (share * apart).sum(dim=-2)
+    unit = torch.where(variance > torch.finfo(variance.dtype).tiny, variance, 1.0).sqrt()
+    reach = torch.where(counts, apart.detach(), 0.0).amax(dim=-2).sqrt()
+    return _PointFrame(origin, unit, reach)
 
 
 def _change_frame(normal: Symmetric4, origin: Tensor, unit: Tensor) -> Symmetric4:
     """T^T M T for points x = unit x' + origin."""
     m00, m01, m02, _, m11, m12, _, m22, _, _ = normal
-    o0, o1, o2 = (component.expand_as(m00) for component in origin.unbind(dim=-1))
+    o0, o1, o2 = (component.expand_as(m00) for component in origin.unbind(dim=-2))
     one = torch.ones_like(o0)
     n03, n13, n23, n33 = multiply(normal, (o0, o1, o2, one))
     last = o0 * n03 + o1 * n13 + o2 * n23 + n33
