@@ -19,6 +19,7 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
 
     Raises:
         ShapeError: a trailing shape differs, or two tensors disagree on a letter.
+        TypeError: not a tensor.
 
     Example:
         >>> import torch
@@ -29,6 +30,8 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     """
     seen: dict[str, tuple[int, str]] = {}
     for name, (tensor, spec) in named.items():
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"{name} must be a torch.Tensor, got {type(tensor).__name__}")
         dims = spec.split()
         shape = tuple(tensor.shape)
         tail = shape[len(shape) - len(dims) :] if len(shape) >= len(dims) else None

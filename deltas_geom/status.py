@@ -6,6 +6,11 @@ from enum import IntEnum
 class Status(IntEnum):
     """Outcome of one point or one segment; stored as int8 tensors.
 
+    OK: valid. TOO_FEW_VIEWS: fewer than two views count. NO_PARALLAX: depth cannot be seen from
+    where the cameras stand. AT_INFINITY: the rays are parallel. BEHIND_CAMERA: they meet behind a
+    used camera. NOT_FINITE_INPUT: something used is NaN or infinite. EMPTY: nothing of the depth
+    range is visible (segments).
+
     Example:
         >>> print(Status.BEHIND_CAMERA.explanation)
         the rays meet behind a used camera: a match is wrong, or a pose is inverted

@@ -85,7 +85,8 @@ def triangulate(
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
         pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything.
-        weights: ``(*B, V, N)`` not negative; they multiply the DLT rows. 0 = unused.
+        weights: ``(*B, V, N)`` not negative (a sign has no effect: the rows they multiply are
+            squared). 0 = unused.
         mask: ``(*B, V, N)`` bool, True = used.
         frame: "rig" solves in each point's rig frame; "world" in the frame of ``proj``, as
             OpenCV and kornia do, whose answer depends on the world's origin and unit.

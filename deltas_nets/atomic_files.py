@@ -136,7 +136,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
 def cannot_write(path: Path, error: OSError) -> UserError:
     """What to tell the user when the system refuses to write."""
     what = f"cannot be written ({error.strerror or error})"
-    return UserError(what, path, "name a folder with --out that can be written and has space")
+    return UserError(what, path, "name a place that can be written and has space")
 
 
 def plain(value: object) -> object:

@@ -3,17 +3,19 @@
 Nothing heavy is imported before a command runs, so that --help is instant.
 """
 
+import contextlib
+import io
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import tyro
 
+from deltas_nets import __version__
 from deltas_nets.config import TrainConfig, to_dict
 from deltas_nets.errors import UserError
 
@@ -36,8 +38,8 @@ class _Prediction:
     """Where to compute: auto, cpu, cuda, cuda:1, mps."""
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
-    work_size: tuple[int, int] | None = None
-    """Height and width that the network sees; chosen to suit it if not given."""
+    work_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
+    """What the network sees; chosen to suit it if not given."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -54,7 +56,7 @@ class _Prediction:
         try:
             return PredictConfig(depth_range=self.depth_range, work_size=self.work_size, **more)
         except ValueError as error:
-            raise UserError(str(error), "command line", "see --help") from None
+            raise UserError(str(error), "command line", "see --help of this command") from None
 
 
 @dataclass(frozen=True)
@@ -91,16 +93,16 @@ class Depth(_Prediction):
     """
 
     capture: tyro.conf.Positional[Path] = field(kw_only=True)
-    """Folder with images, poses and intrinsics."""
+    """Folder with images, poses and intrinsics, or a folder with one such scene inside."""
     out: Path = field(kw_only=True)
     """Folder to write to; the same command continues a run that was stopped."""
-    view_sets: Path | None = None
+    view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen by baseline and overlap if not
     given."""
-    views: int | None = None
+    views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Views per depth map, the anchor included; all of the view sets', or 5, if not given."""
-    size: tuple[int, int] | None = None
-    """Height and width of the maps; the colour image's if not given."""
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
+    """Size of the maps; the colour image's if not given."""
     min_confidence: float = 0.0
     """Leave out pixels of less confidence, 0 to 1."""
     shard: str = "1/1"
@@ -110,40 +112,44 @@ class Depth(_Prediction):
 
     def run(self) -> None:
         """Do it."""
+        import torch
+
+        from deltas_nets.outputs import prepare_output
         from deltas_nets.predict import predict_capture
-        from deltas_nets.pretrained import read_metadata, weights_file
 
         shard = _shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
-        capture, view_sets = _checked_capture(self.capture, self.view_sets, self.views)
+        capture = _open(self.capture)
+        view_sets = _view_sets(capture, self.view_sets, self.views)
+        _check(capture, view_sets)
+        _warn_of_lost(capture, self.view_sets)
         model = self.model()
-        settings = {
-            "predict": to_dict(config),
-            "network": to_dict(model.config),
-            "weights": {
-                "name": self.weights,
-                **{
-                    key: value
-                    for key, value in read_metadata(weights_file(self.weights)).items()
-                    if key in ("step", "seed", "data", "origin")
-                },
+        mine = view_sets[shard[0] - 1 :: shard[1]]
+        folder = prepare_output(
+            self.out,
+            settings={
+                "predict": to_dict(config),
+                "network": to_dict(model.config),
+                "weights": _weights_record(self.weights),
+                "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
+                "views": self.views,
+                "view_sets": view_sets,
             },
-            "view_sets": view_sets,
-        }
-        mine = len(view_sets[shard[0] - 1 :: shard[1]])
-        with _progress("depth", mine) as report:
-            summary = predict_capture(
-                model,
-                capture,
-                view_sets,
-                self.out,
-                config,
-                settings=settings,
-                shard=shard,
-                overwrite=self.overwrite,
-                report=report,
-            )
-        print(f"{mine} depth maps in {self.out}, summary in {summary}")
+            overwrite=self.overwrite,
+            forbidden=capture.path,
+            shard=shard,
+            frame_ids=[views.anchor for views in mine],
+            head={
+                "versions": {"deltas-depth": __version__, "torch": torch.__version__},
+                "lost_poses": sorted(capture.lost),
+            },
+        )
+        with _progress("depth", len(mine)) as report:
+            counts = predict_capture(model, capture, mine, folder, config, report=report)
+        kept = f", {counts.kept} kept from an earlier run" if counts.kept else ""
+        print(f"{counts.written} depth maps in {self.out}{kept}")
+        if counts.blind:
+            _warn(f"{counts.blind} maps without a triangulated point are guesses: see summary.json")
 
 
 @dataclass(frozen=True)
@@ -155,13 +161,13 @@ class Evaluate(_Prediction):
 
     capture: tyro.conf.Positional[Path] = field(kw_only=True)
     """Folder with images, poses, intrinsics and depth/N.png."""
-    view_sets: Path | None = None
+    view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen if not given."""
-    views: int | None = None
+    views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Views per depth map, the anchor included."""
-    predictions: Path | None = None
+    predictions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Score the maps that `deltas depth` wrote here instead of predicting."""
-    json: Path | None = None
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also write the scores to this file."""
 
     def run(self) -> None:
@@ -171,18 +177,26 @@ class Evaluate(_Prediction):
         from deltas_nets.atomic_files import write_json
         from deltas_nets.evaluate.capture import evaluate_files, evaluate_network
         from deltas_nets.evaluate.report import metrics_table, scores_as_json, scores_by_name
+        from deltas_nets.outputs import check_writable, recorded_view_sets
 
         config = self.config()
-        capture, view_sets = _checked_capture(
-            self.capture, self.view_sets, self.views, with_depth=True
-        )
+        if self.json is not None:
+            check_writable(self.json.parent)
+        capture = _open(self.capture)
+        if self.predictions is not None and self.view_sets is None:
+            view_sets = recorded_view_sets(self.predictions)
+        else:
+            view_sets = _view_sets(capture, self.view_sets, self.views)
+        view_sets = _with_depth(capture, view_sets)
+        _check(capture, view_sets, with_depth=True)
         if self.predictions is not None:
             scores = evaluate_files(
                 self.predictions, capture, view_sets, depth_range=self.depth_range
             )
         else:
+            model = self.model()
             with _progress("evaluate", len(view_sets)) as report:
-                scores = evaluate_network(self.model(), capture, view_sets, config, report=report)
+                scores = evaluate_network(model, capture, view_sets, config, report=report)
         title = f"{capture.path}: {len(scores.frames)} frames"
         Console().print(metrics_table(scores_by_name(scores), title=title))
         if self.json is not None:
@@ -208,6 +222,10 @@ class Train:
     """Start from these weights."""
     start_step: int = 0
     """Go on in the schedule at this step (with --init)."""
+    checkpoint_every: int = 200
+    """Steps between checkpoints; Ctrl-C writes one too."""
+    validate_every: int = 500
+    """Steps between evaluations on rooms that no training sees."""
     encoder: str = "pretrained"
     """EfficientNet-Lite0 weights for the encoder: "pretrained" is the package of the train
     extra, "none" starts from random weights, otherwise a file."""
@@ -219,7 +237,17 @@ class Train:
         from deltas_nets.train.checkpoint import load_config
         from deltas_nets.train.fit import Start, fit
 
+        if self.resume and self.config != TrainConfig():
+            raise UserError(
+                "a resumed run keeps its config", "--resume", "leave out the options that change it"
+            )
+        if self.start_step and self.init is None:
+            raise UserError("start from what?", "--start-step", "add --init FILE")
         config = load_config(self.out) if self.resume else self.config
+        if self.start_step >= config.steps:
+            raise UserError(
+                f"the schedule ends at {config.steps}", "--start-step", "start before that"
+            )
         if not self.resume and (self.out / "checkpoint.pt").exists():
             raise UserError(
                 "the folder holds another run", self.out, "add --resume or name a new folder"
@@ -227,22 +255,22 @@ class Train:
         fresh = not self.resume and self.init is None
         encoder = _encoder_file(self.encoder) if fresh else None
         start = Start(encoder, self.init, self.start_step, self.resume)
-        weights = fit(config, self.out, start)
+        weights = fit(
+            config,
+            self.out,
+            start,
+            checkpoint_every=self.checkpoint_every,
+            validate_every=self.validate_every,
+        )
         print(f"weights in {weights}")
 
 
 def main() -> None:
     """Entry point of the `deltas` command."""
-    arguments = sys.argv[1:]
-    try:
-        command: Demo | Depth | Evaluate | Train = tyro.cli(
-            Demo | Depth | Evaluate | Train,
-            prog="deltas",
-            description="Metric depth from posed images.",
-            args=arguments,
-        )
-    except ValueError as error:
-        _fail(UserError(str(error), "command line", "see deltas --help"))
+    if sys.argv[1:] == ["--version"]:
+        print(f"deltas-depth {__version__}")
+        return
+    command = _parse(sys.argv[1:])
     try:
         command.run()
     except UserError as error:
@@ -250,12 +278,44 @@ def main() -> None:
             raise
         _fail(error)
     except KeyboardInterrupt:
+        print("deltas: stopped; what is finished is kept", file=sys.stderr)
         sys.exit(130)
 
 
-def _fail(error: UserError) -> None:
+def _parse(arguments: list[str]) -> Demo | Depth | Evaluate | Train:
+    """The command that the arguments name; one line of error where they make no sense."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            command: Demo | Depth | Evaluate | Train = tyro.cli(
+                Demo | Depth | Evaluate | Train,
+                prog="deltas",
+                description="Metric depth from posed images.",
+                args=arguments,
+            )
+    except ValueError as error:
+        _fail(UserError(str(error), "command line", _help_of(arguments)))
+    except SystemExit as stopped:
+        if not stopped.code:
+            raise
+        # tyro draws a box; what it says fits a line.
+        words = re.sub(r"\[/?bold\]|[─│╭╮╰╯]", " ", said.getvalue()).split()
+        _fail(UserError(" ".join(words)[:200], "command line", _help_of(arguments)))
+    return command
+
+
+def _help_of(arguments: list[str]) -> str:
+    known = [word for word in arguments[:1] if word in ("demo", "depth", "evaluate", "train")]
+    return " ".join(["see deltas", *known, "--help"])
+
+
+def _fail(error: UserError) -> NoReturn:
     print(f"deltas: {error}", file=sys.stderr)
     sys.exit(2)
+
+
+def _warn(text: str) -> None:
+    print(f"deltas: warning: {text}", file=sys.stderr)
 
 
 def _device(name: str) -> str:
@@ -278,29 +338,72 @@ def _shard(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _checked_capture(
-    path: Path, view_sets_file: Path | None, num_views: int | None, *, with_depth: bool = False
-) -> tuple["Capture", tuple["ViewSet", ...]]:
-    """A capture and its view sets, with everything they name checked."""
+def _open(path: Path) -> "Capture":
     from deltas_nets.data.capture import open_capture
-    from deltas_nets.data.view_sets import check_frames, choose_view_sets, read_view_sets
+
+    return open_capture(path)
+
+
+def _view_sets(
+    capture: "Capture", file: Path | None, num_views: int | None
+) -> tuple["ViewSet", ...]:
+    """The file's view sets, shortened to so many views, or ones that we choose."""
+    from deltas_nets.data.view_sets import choose_view_sets, read_view_sets
 
     if num_views is not None and num_views < 2:
         raise UserError("too few views", f"--views {num_views}", "use 2 or more")
-    capture = open_capture(path)
-    if view_sets_file is None:
-        view_sets = choose_view_sets(capture, num_views or 5)
-    else:
-        view_sets = read_view_sets(view_sets_file, capture)
-        if num_views is not None:
-            view_sets = tuple(
-                views._replace(sources=views.sources[: num_views - 1]) for views in view_sets
-            )
-    check_frames(capture, view_sets, with_depth=with_depth)
+    if file is None:
+        return choose_view_sets(capture, num_views or 5)
+    view_sets = read_view_sets(file, capture)
+    if num_views is None:
+        return view_sets
+    return tuple(views._replace(sources=views.sources[: num_views - 1]) for views in view_sets)
+
+
+def _with_depth(capture: "Capture", view_sets: tuple["ViewSet", ...]) -> tuple["ViewSet", ...]:
+    """Those whose anchor has sensor depth."""
+    found = tuple(
+        views for views in view_sets if capture.frame(views.anchor).depth_path is not None
+    )
+    if not found:
+        raise UserError("the capture has no sensor depth", capture.path, "add depth/N.png")
+    if len(found) < len(view_sets):
+        _warn(f"{len(view_sets) - len(found)} anchors without sensor depth are not scored")
+    return found
+
+
+def _check(
+    capture: "Capture", view_sets: tuple["ViewSet", ...], *, with_depth: bool = False
+) -> None:
+    """Decode everything that will be used, before anything is written."""
+    from deltas_nets.data.view_sets import check_frames
+
+    count = len({id for views in view_sets for id in (views.anchor, *views.sources)})
+    with _progress("checking images", count) as report:
+        check_frames(capture, view_sets, with_depth=with_depth, report=report)
+
+
+def _warn_of_lost(capture: "Capture", view_sets_file: Path | None) -> None:
+    from deltas_nets.data.capture import ids_in_words
+
     if capture.lost and view_sets_file is None:
-        lost = len(capture.lost)
-        print(f"deltas: warning: {lost} frames without a usable pose left out", file=sys.stderr)
-    return capture, view_sets
+        words = ids_in_words(sorted(capture.lost))
+        _warn(f"frames without a usable pose are left out: {words}")
+
+
+def _weights_record(name: str) -> dict[str, str]:
+    """What identifies weights, and where they come from."""
+    import hashlib
+
+    from deltas_nets.pretrained import read_metadata, weights_file
+
+    file = weights_file(name)
+    metadata = read_metadata(file)
+    record = {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    for key in ("step", "seed", "data", "origin"):
+        if key in metadata:
+            record[key] = metadata[key]
+    return record
 
 
 def _encoder_file(name: str) -> Path | None:
@@ -319,12 +422,13 @@ def _encoder_file(name: str) -> Path | None:
     return file
 
 
-@contextmanager
+@contextlib.contextmanager
 def _progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
     """A progress bar on standard output; the value is called for every finished frame."""
     from rich.progress import Progress
 
-    with Progress() as bar:
+    # On standard output, and gone when done: an error is alone on its stream.
+    with Progress(transient=True) as bar:
         task = bar.add_task(name, total=total)
         yield lambda _: bar.advance(task)
 

@@ -101,15 +101,17 @@ class DataConfig:
     """Procedural rooms to train on."""
 
     num_rooms: int = 4000
+    """Rooms in an epoch."""
     seed: int = 1000
     """Seed of the first room; validation rooms have seeds below 1000."""
     num_views: int = 5
     """Views rendered per room; any of them can be the anchor."""
     height: int = 192
+    """Height of the rendered images, pixels."""
     width: int = 256
-    """Size of the rendered images, pixels."""
+    """Width of the rendered images, pixels."""
     cache: str | None = None
-    """Folder that keeps rendered rooms; rendering is repeated every epoch without it."""
+    """Folder that keeps rendered rooms, 1.7 MB each; without it they are rendered each time."""
     workers: int = 1
     """Processes that read or render ahead; 0 does it in the training process."""
 
@@ -126,23 +128,29 @@ class TrainConfig:
     sizes: tuple[tuple[int, int], ...] = ((144, 192), (144, 192), (192, 256))
     """(height, width) of the images of a step, drawn at random."""
     batch_size: int = 6
+    """Rooms per step."""
     learning_rate: float = 2e-3
     """Peak of the one-cycle schedule; the pretrained encoder gets a fifth of it."""
     weight_decay: float = 1e-4
+    """Of AdamW."""
     warmup: int = 100
-    """Steps until the peak."""
+    """Steps until the peak; a tenth of all at most."""
     min_views: int = 2
+    """Fewest views per step, the anchor included; their number is drawn at random."""
     max_views: int = 5
-    """Views per step, the anchor included, drawn at random."""
+    """Most views per step."""
     num_keypoints: int = 320
     """Points per image in training."""
     pose_noise: tuple[float, float] = (0.004, 0.0015)
     """Standard deviation of the sources' pose errors: metres, radians."""
     clip_gradient: float = 5.0
+    """Largest norm of the gradient."""
     average: float = 0.995
     """Decay of the running average of the weights, which is what is evaluated and shipped."""
     seed: int = 0
+    """Of everything random."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    """bf16-mixed is faster where the processor has bfloat16; geometry stays in float32."""
 
     def __post_init__(self) -> None:
         if not 2 <= self.min_views <= self.max_views <= self.data.num_views:
@@ -152,6 +160,8 @@ class TrainConfig:
             )
         if self.steps < 1 or self.batch_size < 1:
             raise ValueError("steps and batch_size must be at least 1")
+        if not self.sizes or min(map(min, self.sizes)) < 32:
+            raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {self.sizes}")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def _draw_matches(
     colors = matplotlib.colormaps["hsv"](np.linspace(0, 0.92, len(chosen)))
     anchor.imshow(images[0])
     x, y = keypoints.numpy().T
-    anchor.scatter(x, y, s=3, c="white", alpha=0.5, linewidths=0)
+    anchor.scatter(x, y, s=6, c="white", edgecolors="black", linewidths=0.4)
     anchor.scatter(x[chosen], y[chosen], s=34, c=colors, edgecolors="black")
     anchor.set_title(f"anchor, {len(keypoints)} points")
     source.imshow(images[1])

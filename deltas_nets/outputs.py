@@ -27,13 +27,16 @@ from deltas_nets.atomic_files import (
     write_json,
     write_points_ply,
 )
+from deltas_nets.data.view_sets import ViewSet
 from deltas_nets.errors import UserError
 
 __all__ = [
     "OutputFolder",
+    "check_writable",
     "prepare_output",
     "read_depth_png",
     "read_points_ply",
+    "recorded_view_sets",
     "write_confidence_png",
     "write_depth_png",
     "write_json",
@@ -89,10 +92,10 @@ class OutputFolder:
         self._frames.setdefault(str(id), {"status": "kept"})
 
     def write_summary(self, status: str, **more: Any) -> None:
-        """Write the summary: ``running`` at the start, ``complete`` at the end.
+        """Write the summary: ``running`` at the start and in between, then how it ended.
 
         Args:
-            status: ``running`` or ``complete``.
+            status: ``running``, ``stopped`` or ``complete``.
             more: goes to the summary beside the settings (times, counts).
         """
         self._head = self._head | more
@@ -144,8 +147,8 @@ def prepare_output(
         out: the folder; its parents are made too.
         settings: what the results depend on (weights, views, sizes ...; not the device or
             the shard). A run continues another only where all of it is equal.
-        overwrite: start again: remove the frames of a run of ours, and use a folder with
-            other contents, in which only files of the same names are replaced.
+        overwrite: start again: remove the frames that earlier runs were to write, and use a folder
+            with other contents, in which only files of the same names are replaced.
         forbidden: the capture. Its own depth/ would be overwritten, so it is never an output.
         shard: which of how many runs that fill the folder this is, from 1.
         frame_ids: the frames of this run: what ``overwrite`` removes where others work too.
@@ -158,12 +161,15 @@ def prepare_output(
         UserError: the folder cannot be written, holds something else, or was made with other
             settings. Nothing in it has been changed then.
     """
-    out = Path(out)
+    out, frame_ids = Path(out), list(frame_ids)
     wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
     if forbidden is not None and out.resolve() == forbidden.resolve():
         what = "the output folder is the capture itself"
         raise UserError(what, out, "name another folder with --out")
-    _make_writable(out)
+    if any((out / name).is_dir() for name in ("color", "pose")):
+        # Its depth/ may be what a sensor measured: not even --overwrite is meant for that.
+        raise UserError("the output folder is a capture", out, "name another folder with --out")
+    check_writable(out)
     # Listed before the summaries are read: what another shard has made by now has a summary.
     others = [name for name in sorted(os.listdir(out)) if not TEMPORARY.match(name)]
     summaries = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
@@ -179,14 +185,23 @@ def prepare_output(
     frames = {} if overwrite or own is None else dict(own["frames"])
     folder = OutputFolder(
         out,
-        head={"writer": WRITER, "status": "running", **(head or {}), "settings": wanted},
+        head={
+            "writer": WRITER,
+            "status": "running",
+            **(head or {}),
+            "settings": wanted,
+            "anchors": frame_ids,
+        },
         frames=frames,
         shard=shard,
     )
     try:
         # Before the new summary: killed in between, the old one still says what made the rest.
         if overwrite:
-            _remove_frames(out, frame_ids, everything=bool(earlier) and shard[1] == 1)
+            planned = {id for summary in earlier for id in summary.get("anchors", ())}
+            _remove_frames(out, {*frame_ids, *(planned if shard[1] == 1 else ())})
+            if shard[1] == 1:
+                _remove_shard_summaries(out)
         if shard[1] == 1:
             _remove_temporary(out)
         folder.write_summary("running")
@@ -197,14 +212,34 @@ def prepare_output(
     return folder
 
 
-def _make_writable(out: Path) -> None:
-    """Make the folder and write a file: permission bits mislead on network drives and root."""
+def check_writable(out: Path) -> None:
+    """Make the folder and write a file: permission bits mislead on network drives and root.
+
+    Raises:
+        UserError: it is a file, or the system refuses.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError("this is a file, not a folder", out, "name a folder with --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=out, prefix=".", suffix=".deltas-tmp") as file:
             file.write(b"x")
     except OSError as error:
         raise cannot_write(out, error) from error
+
+
+def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
+    """The view sets of the run that filled a folder.
+
+    Raises:
+        UserError: no run of `deltas depth` did.
+    """
+    summary = _read_summary(out / SUMMARY)
+    if summary is None or "view_sets" not in summary["settings"]:
+        raise UserError("no run of deltas depth is recorded", out / SUMMARY, "run it first")
+    return tuple(
+        ViewSet(anchor, tuple(sources)) for anchor, sources in summary["settings"]["view_sets"]
+    )
 
 
 def _file(out: Path, kind: str, id: FrameId) -> Path:
@@ -240,18 +275,17 @@ def _difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     return "; ".join(words) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
 
 
-def _remove_frames(out: Path, ids: Iterable[FrameId], *, everything: bool) -> None:
-    """Remove outputs: of these frames, or all that a run of ours has left."""
+def _remove_frames(out: Path, ids: Iterable[FrameId]) -> None:
+    """Remove the outputs of these frames; other files of the folder are not ours."""
     for id in ids:
         for kind in KINDS:
             _file(out, kind, id).unlink(missing_ok=True)
-    if everything:
-        for kind, suffix in KINDS.items():
-            for path in (out / kind).glob(f"*{suffix}"):
-                path.unlink()
-        for path in out.iterdir():
-            if SHARD_SUMMARY.fullmatch(path.name):
-                path.unlink()
+
+
+def _remove_shard_summaries(out: Path) -> None:
+    for path in out.iterdir():
+        if SHARD_SUMMARY.fullmatch(path.name):
+            path.unlink()
 
 
 def _remove_temporary(out: Path) -> None:

@@ -3,8 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,12 +11,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from deltas_geom import PosedViews, unproject
-from deltas_nets import __version__
 from deltas_nets.data.capture import Capture, Frame
 from deltas_nets.data.sample import fit_work_size, load_views, resize_image
 from deltas_nets.data.view_sets import ViewSet
 from deltas_nets.network.deltas import Deltas, DepthPrediction
-from deltas_nets.outputs import prepare_output
+from deltas_nets.outputs import OutputFolder
 
 WORK_PIXELS = 224 * 304
 """Pixels of the image that the network sees, unless a size is given."""
@@ -49,6 +47,17 @@ class PredictConfig:
             raise ValueError(f"--min-confidence must be within 0 to 1, got {self.min_confidence}")
 
 
+SECONDS_BETWEEN_SUMMARIES = 5.0
+
+
+class Counts(NamedTuple):
+    """What became of the view sets: maps written, kept from before, and written blindly."""
+
+    written: int
+    kept: int
+    blind: int
+
+
 class FrameDepth(NamedTuple):
     """Depth of one frame.
 
@@ -58,7 +67,7 @@ class FrameDepth(NamedTuple):
         points: ``(N, 3)`` in the capture's world, metres.
         colors: ``(N, 3)`` uint8.
         prediction: what the network gave, at the size it works at.
-        image: ``(3, h, w)`` the anchor as the network saw it.
+        images: ``(V, 3, h, w)`` the frames as the network saw them.
         views: the cameras, relative to the anchor, at the network's size.
     """
 
@@ -125,69 +134,72 @@ def predict_capture(
     model: Deltas,
     capture: Capture,
     view_sets: Sequence[ViewSet],
-    out: Path,
+    folder: OutputFolder,
     config: PredictConfig,
     *,
-    settings: dict[str, Any],
-    shard: tuple[int, int] = (1, 1),
-    overwrite: bool = False,
     report: Callable[[str], None] = lambda _: None,
-) -> Path:
-    """Write depth, confidence and points of every view set.
+) -> Counts:
+    """Write depth, confidence and points of every view set that is not finished yet.
 
     Args:
         model: a trained network.
         capture: the frames.
-        view_sets: anchors and sources; those of this shard are processed.
-        out: folder for ``depth/``, ``confidence/``, ``points/`` and ``summary.json``.
+        view_sets: anchors and sources.
+        folder: from :func:`deltas_nets.outputs.prepare_output`.
         config: sizes, range, confidence.
-        settings: what else the results depend on; recorded, and compared when continuing.
-        shard: (i, n): this run does every n-th view set, from the i-th.
-        overwrite: see :func:`deltas_nets.outputs.prepare_output`.
         report: called with the id of every finished frame.
 
     Returns:
-        The summary's path.
+        How many maps were written, kept, and written without a single triangulated point.
 
     Raises:
-        UserError: a file cannot be read or written.
+        UserError: a file cannot be read or written. What is finished by then stays, and is
+            kept when the same is asked for again.
     """
-    mine = view_sets[shard[0] - 1 :: shard[1]]
-    folder = prepare_output(
-        out,
-        settings=settings,
-        overwrite=overwrite,
-        forbidden=capture.path,
-        shard=shard,
-        frame_ids=[views.anchor for views in mine],
-        head={
-            "versions": {"deltas-depth": __version__, "torch": torch.__version__},
-            "capture": str(capture.path),
-            "lost_poses": len(capture.lost),
+    counts = Counts(0, 0, 0)
+    began = recorded = time.perf_counter()
+    status = "stopped"
+    try:
+        for views in view_sets:
+            if folder.is_finished(views.anchor):
+                folder.keep_frame(views.anchor)
+                counts = counts._replace(kept=counts.kept + 1)
+            else:
+                blind = _predict_into(model, capture, views, folder, config)
+                counts = Counts(counts.written + 1, counts.kept, counts.blind + blind)
+            if time.perf_counter() - recorded > SECONDS_BETWEEN_SUMMARIES:
+                folder.write_summary("running")
+                recorded = time.perf_counter()
+            report(str(views.anchor))
+        status = "complete"
+    finally:
+        folder.write_summary(status, seconds=round(time.perf_counter() - began, 3))
+    return counts
+
+
+def _predict_into(
+    model: Deltas,
+    capture: Capture,
+    views: ViewSet,
+    folder: OutputFolder,
+    config: PredictConfig,
+) -> bool:
+    """Write one view set's outputs; whether nothing could be triangulated."""
+    started = time.perf_counter()
+    frames = [capture.frame(id) for id in (views.anchor, *views.sources)]
+    result = predict_frame(model, frames, config)
+    valid = int(result.prediction.points.valid.sum())
+    folder.write_frame(
+        views.anchor,
+        depth=result.depth,
+        probability=result.confidence,
+        points=result.points,
+        colors=result.colors,
+        record={
+            "status": "ok" if valid else "no point triangulated",
+            "sources": views.sources,
+            "valid_points": valid,
+            "seconds": round(time.perf_counter() - started, 4),
         },
     )
-    began = time.perf_counter()
-    for views in mine:
-        if folder.is_finished(views.anchor):
-            folder.keep_frame(views.anchor)
-            report(str(views.anchor))
-            continue
-        started = time.perf_counter()
-        frames = [capture.frame(id) for id in (views.anchor, *views.sources)]
-        result = predict_frame(model, frames, config)
-        folder.write_frame(
-            views.anchor,
-            depth=result.depth,
-            probability=result.confidence,
-            points=result.points,
-            colors=result.colors,
-            record={
-                "status": "ok",
-                "sources": views.sources,
-                "valid_points": int(result.prediction.points.valid.sum()),
-                "seconds": round(time.perf_counter() - started, 4),
-            },
-        )
-        report(str(views.anchor))
-    folder.write_summary("complete", seconds=round(time.perf_counter() - began, 3))
-    return out / "summary.json"
+    return valid == 0

@@ -35,6 +35,8 @@ def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = 
     """
     file = weights_file(name_or_file)
     metadata = read_metadata(file)
+    if "network" not in metadata:
+        raise UserError("this file holds no deltas network", file, "name a file of deltas train")
     try:
         config = from_dict(NetworkConfig, json.loads(metadata["network"]))
     except (KeyError, ValueError, TypeError) as error:
@@ -70,7 +72,9 @@ def read_metadata(file: Path) -> dict[str, str]:
             metadata: dict[str, str] | None = opened.metadata()
     except (SafetensorError, OSError) as error:
         raise UserError(
-            f"not a safetensors file ({error})", file, "name a file that deltas train wrote"
+            f"not a safetensors file ({error})",
+            file,
+            "name the weights.safetensors that deltas train wrote",
         ) from None
     return metadata or {}
 

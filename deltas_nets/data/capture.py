@@ -1,5 +1,6 @@
 """A capture: posed frames of one scene, whatever the folder they came from looks like."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,8 +67,8 @@ class Frame:
             UserError: the frame has none, or the file is damaged or not a 16-bit image.
         """
         if self.depth_path is None:
-            remedy = "add depth/N.png to the capture or run without sensor depth"
-            raise UserError(f"frame {self.id} has no sensor depth", self.image_path, remedy)
+            file = self.image_path.parent.parent / "depth" / f"{self.id}.png"
+            raise UserError(f"frame {self.id} has no sensor depth", file, "add the file")
         image = _decode(self.depth_path, remedy="copy the file again")
         if not image.mode.startswith("I"):
             what = f"depth has pixels of type {image.mode}, not 16-bit millimetres"
@@ -87,6 +88,14 @@ class Capture:
     """Frames with a usable pose, in the order of their ids."""
     lost: Mapping[int, UserError]
     """Frames left out because of their pose, with the error that asking for them raises."""
+
+    def fingerprint(self) -> str:
+        """A hash of all cameras: what changes when poses or intrinsics do."""
+        digest = hashlib.sha256()
+        for id, frame in self.frames.items():
+            digest.update(f"{id} {frame.image_size}".encode())
+            digest.update(frame.K.tobytes() + frame.cam_from_world.tobytes())
+        return digest.hexdigest()
 
     def frame(self, id: int) -> Frame:
         """The frame called ``id``.

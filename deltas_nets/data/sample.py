@@ -14,6 +14,8 @@ from deltas_nets.data.capture import FloatArray, Frame
 
 __all__ = ["depth_at_image", "fit_work_size", "load_views", "resize_image"]
 
+SMALLEST_BASELINE = 1e-6
+"""Metres; cameras nearer to each other stand in one place, as files have six digits."""
 MULTIPLE = 16
 """Sides the network's coarsest stride divides, so that no feature map is cut off."""
 
@@ -42,6 +44,8 @@ def load_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> tuple[
         # In float64, before the cast: float32 keeps 6 cm at 1000 km and 0.06 mm at 1 km, and
         # the baseline is what is left when two such numbers are subtracted.
         cam_from_anchor = frame.cam_from_world @ world_from_anchor
+        if np.linalg.norm(cam_from_anchor[:3, 3]) < SMALLEST_BASELINE:
+            cam_from_anchor[:3, 3] = 0  # rounding, which would pass for parallax
         poses.append(torch.from_numpy(cam_from_anchor))
     poses[0] = torch.eye(4, dtype=torch.float64)  # exactly, not but for rounding
     views = PosedViews(torch.stack(intrinsics).float(), torch.stack(poses).float())

@@ -1,7 +1,7 @@
 """Which frames are looked at together: read from a file, or chosen by geometry."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -138,7 +138,11 @@ def choose_view_sets(
 
 
 def check_frames(
-    capture: Capture, view_sets: Sequence[ViewSet], *, with_depth: bool = False
+    capture: Capture,
+    view_sets: Sequence[ViewSet],
+    *,
+    with_depth: bool = False,
+    report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Check every frame that a set names, before anything is computed or written.
 
@@ -146,6 +150,7 @@ def check_frames(
         capture: the frames.
         view_sets: what will be used of them.
         with_depth: whether the sensor depth of the anchors will be read too.
+        report: called with the id of every checked frame.
 
     Raises:
         UserError: a frame is missing, its pose is not finite, or its image or depth does not
@@ -158,6 +163,7 @@ def check_frames(
             remedy = "take the frame out of the view sets"
             raise UserError(f"the pose of frame {id} is not finite", frame.image_path, remedy)
         frame.read_image()
+        report(str(id))
     if with_depth:
         for view_set in view_sets:
             capture.frame(view_set.anchor).read_depth()

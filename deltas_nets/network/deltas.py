@@ -111,9 +111,12 @@ class Deltas(nn.Module):
         Raises:
             ShapeError: a trailing shape differs, or there is no source.
             ValueError: the depth range makes no sense.
+            TypeError: the images are integers.
         """
         check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
         check_depth_range(depth_range)
+        if not images.is_floating_point():
+            raise TypeError(f"images must be floating point in [0, 1], got {images.dtype}")
         if images.shape[-4] < 2:
             raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
         batch, size = images.shape[:-4], (images.shape[-2], images.shape[-1])
@@ -136,12 +139,13 @@ class Deltas(nn.Module):
             )
             matches = matched.matches
             points = triangulate(flat.proj, matches.pixels, matches.weights, matches.mask)
-            depth = points.depth[:, 0].clamp(0.5 * depth_range[0], 2 * depth_range[1])
+            depth = points.depth[:, 0]
+            near, far = 0.5 * depth_range[0], 2 * depth_range[1]
             sparse = rasterize_depth(
                 keypoints.pixels,
                 depth,
                 image_size=size,
-                mask=points.valid,
+                mask=points.valid & (depth > near) & (depth < far),
                 weights=matched.confidence,
                 reduce="mean",
             )

@@ -3,7 +3,8 @@
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -83,7 +84,13 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     step, last = state.step, min(config.steps, stop or config.steps)
     loader = room_loader(config, start=step, stop=last)
-    with _progress() as progress, (folder / "log.jsonl").open("a") as log:
+
+    def save() -> None:
+        save_run(folder, config, state._replace(step=step), origin=origin)
+
+    if not start.resume:
+        save()  # before the first step, so that a run can always be resumed
+    with _progress() as progress, (folder / "log.jsonl").open("a") as log, _saving_if_stopped(save):
         bar = progress.add_task("training", total=config.steps, completed=step, loss="")
         for rooms in loader:
             began = time.perf_counter()
@@ -97,12 +104,11 @@ def fit(
                 print(json.dumps(entry), file=log, flush=True)
                 progress.update(bar, loss=f"loss {entry['total']:.3f}")
                 if not math.isfinite(entry["total"]):
-                    raise UserError(
-                        f"training diverged at step {step}", folder, "lower --learning-rate"
-                    )
+                    what = f"training diverged at step {step}"
+                    raise UserError(what, folder, "lower --learning-rate")
             progress.update(bar, completed=step)
             if step % checkpoint_every == 0 or step == last:
-                save_run(folder, config, state._replace(step=step), origin=origin)
+                save()
             if step % validate_every == 0 or step == last:
                 validation = validate(state.average.model)
                 print(json.dumps({"step": step, "validation": validation}), file=log, flush=True)
@@ -110,9 +116,19 @@ def fit(
     return folder / "weights.safetensors"
 
 
+@contextmanager
+def _saving_if_stopped(save: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C costs no steps."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        save()
+        raise
+
+
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
     """Linear warm-up, then half a cosine down to a hundredth."""
-    warm = min(1.0, (step + 1) / config.warmup)
+    warm = min(1.0, (step + 1) / max(1, min(config.warmup, config.steps // 10)))
     return warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / config.steps)))
 
 
@@ -217,7 +233,8 @@ def _log_entry(step: int, losses: Losses, seconds: float) -> dict[str, float]:
 
 
 def _in_words(metrics: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.4f}" for name, value in metrics.items())
+    words = {"abs_rel": "Abs Rel", "delta1": "delta<1.25", "sparse": "median of points"}
+    return ", ".join(f"{words[name]} {value:.4f}" for name, value in metrics.items())
 
 
 def _progress() -> Progress:

@@ -114,6 +114,93 @@ def test_a_stopped_run_is_continued_and_another_refused(
     assert run(*other, "--overwrite").code == 0
 
 
+def test_another_capture_with_the_same_ids_is_not_taken_for_finished(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    first, second = make_capture(path=tmp_path / "one"), make_capture(path=tmp_path / "two")
+    out = tmp_path / "out"
+    assert run("depth", first, "--out", out, "--weights", weights).code == 0
+    assert_one_line(run("depth", second, "--out", out, "--weights", weights), "other settings")
+    text = (first / "intrinsic" / "intrinsic_color.txt").read_text()
+    (first / "intrinsic" / "intrinsic_color.txt").write_text(text.replace("64.0", "60.0"))
+    assert_one_line(run("depth", first, "--out", out, "--weights", weights), "capture")
+
+
+def test_a_continued_run_keeps_the_records_of_the_first(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    command = ["depth", make_capture(), "--out", tmp_path / "out", "--weights", weights]
+    run(*command)
+    again = run(*command)
+    assert "0 depth maps" in again.out
+    assert "4 kept" in again.out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert all("seconds" in frame for frame in summary["frames"].values())
+
+
+def test_a_stopped_run_says_so_and_keeps_what_is_finished(
+    run: Run,
+    make_capture: MakeCapture,
+    weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from deltas_nets import predict
+
+    finished = predict.predict_frame
+    calls = []
+
+    def stops_at_the_third(*arguments: object) -> predict.FrameDepth:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return finished(*arguments)  # type: ignore[arg-type]
+
+    command = ["depth", make_capture(), "--out", tmp_path / "out", "--weights", weights]
+    with monkeypatch.context() as patch:
+        patch.setattr(predict, "predict_frame", stops_at_the_third)
+        stopped = run(*command)
+    assert stopped.code == 130
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["status"], len(summary["frames"])) == ("stopped", 2)
+    assert "2 kept" in run(*command).out
+
+
+def test_overwriting_leaves_other_peoples_files(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    (out / "points").mkdir(parents=True)
+    (out / "points" / "mine.ply").write_text("mine")
+    command = ["depth", make_capture(), "--out", out, "--weights", weights]
+    assert_one_line(run(*command), "holds something else", "--overwrite")
+    for _ in range(2):
+        assert run(*command, "--overwrite").code == 0
+        assert (out / "points" / "mine.ply").read_text() == "mine"
+
+
+def test_no_capture_is_ever_written_into(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    capture, other = make_capture(path=tmp_path / "one"), make_capture(path=tmp_path / "two")
+    before = (other / "depth" / "0.png").read_bytes()
+    for out in (capture, other):
+        command = ["depth", capture, "--out", out, "--weights", weights, "--overwrite"]
+        assert_one_line(run(*command), "capture", "another folder")
+    assert (other / "depth" / "0.png").read_bytes() == before
+
+
+def test_cameras_in_one_place_are_warned_of(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    capture, out = make_capture(step=0.0, origin=(3.1, -2.7, 11.3)), tmp_path / "out"
+    result = run("depth", capture, "--out", out, "--weights", weights)
+    assert result.code == 0
+    assert "4 maps without a triangulated point are guesses" in result.err
+    frames = json.loads((out / "summary.json").read_text())["frames"].values()
+    assert {frame["status"] for frame in frames} == {"no point triangulated"}
+
+
 def test_shards_share_the_work(
     run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
 ) -> None:
@@ -144,9 +231,9 @@ def test_lost_poses_are_left_out_with_one_warning(
     result = run("depth", capture, "--out", out, "--weights", weights)
     assert result.code == 0
     assert result.err.count("\n") == 1
-    assert "1 frames without a usable pose" in result.err
+    assert "frames without a usable pose are left out: 2" in result.err
     assert not (out / "depth" / "2.png").exists()
-    assert json.loads((out / "summary.json").read_text())["lost_poses"] == 1
+    assert json.loads((out / "summary.json").read_text())["lost_poses"] == [2]
 
 
 def break_pose(folder: Path) -> None:
@@ -202,6 +289,9 @@ def test_wrong_options_are_one_line(run: Run, make_capture: MakeCapture, tmp_pat
     assert_one_line(run(*base, "--shard", "3/2"), "--shard 3/2", "I/N")
     assert_one_line(run(*base, "--views", 1), "--views 1", "2 or more")
     assert_one_line(run(*base, "--size", 4, 4), "--size", "32 or more")
+    assert_one_line(run(*base, "--size", 100), "see deltas depth --help")
+    assert_one_line(run(*base, "--vews", 3), "--vews", "see deltas depth --help")
+    assert_one_line(run("dept"), "see deltas --help")
     assert not out.exists()
 
 
@@ -240,10 +330,23 @@ def test_evaluate_without_maps_or_truth_is_one_line(
 ) -> None:
     capture = make_capture(path=tmp_path / "with")
     assert_one_line(
-        run("evaluate", capture, "--predictions", tmp_path / "none"), "0.png", "run deltas depth"
+        run("evaluate", capture, "--predictions", tmp_path / "none"), "summary.json", "run it first"
     )
     blind = make_capture(path=tmp_path / "without", depth_size=None)
     assert_one_line(run("evaluate", blind), "no sensor depth")
+    (tmp_path / "afile").write_text("")
+    assert_one_line(run("evaluate", capture, "--json", tmp_path / "afile" / "x.json"), "afile")
+
+
+def test_anchors_without_depth_are_left_out_of_the_scores(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    capture = make_capture()
+    (capture / "depth" / "1.png").unlink()
+    result = run("evaluate", capture, "--weights", weights, "--json", tmp_path / "a.json")
+    assert result.code == 0
+    assert "1 anchors without sensor depth" in result.err
+    assert len(json.loads((tmp_path / "a.json").read_text())["abs_rel_by_frame"]) == 3
 
 
 def test_train_resume_and_refusal(run: Run, tmp_path: Path) -> None:
@@ -256,7 +359,16 @@ def test_train_resume_and_refusal(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("train", "--out", out, *tiny), "another run", "--resume")
     assert run("train", "--out", out, "--resume").code == 0
     assert_one_line(run("train", "--out", tmp_path / "x", "--resume"), "nothing to resume")
-    assert_one_line(run("train", "--out", tmp_path / "x", "--steps", 0), "steps")
+    fresh = ["train", "--out", tmp_path / "x"]
+    assert_one_line(run(*fresh, "--steps", 0), "steps")
+    assert_one_line(run(*fresh, "--sizes", 10, 10), "sizes", "32 or more")
+    assert_one_line(run(*fresh, "--start-step", 3), "--init FILE")
+    weights = out / "weights.safetensors"
+    late = ["--init", weights, "--start-step", 9, "--steps", 5]
+    assert_one_line(run(*fresh, *late), "--start-step", "ends at 5")
+    assert_one_line(run("train", "--out", out, "--resume", "--steps", 9), "keeps its config")
+    assert_one_line(run("depth", "x", "--out", "y", "--weights", out / "checkpoint.pt"), "x")
+    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.parametrize("command", ["demo", "depth", "evaluate", "train"])
@@ -264,6 +376,12 @@ def test_every_command_explains_itself_with_an_example(run: Run, command: str) -
     result = run(command, "--help")
     assert result.code == 0
     assert f"Example: deltas {command}" in " ".join(result.out.split())
+
+
+def test_the_version_is_told(run: Run) -> None:
+    from deltas_nets import __version__
+
+    assert run("--version").out == f"deltas-depth {__version__}\n"
 
 
 def test_help_does_not_wait_for_torch() -> None:

@@ -80,7 +80,7 @@ def test_ten_steps_then_a_prediction(tmp_path: Path) -> None:
     log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert log[-2]["step"] == 10
     assert "abs_rel" in log[-1]["validation"]
-    assert "held-out rooms abs_rel" in said[-1]
+    assert "held-out rooms Abs Rel" in said[-1]
 
 
 def test_a_resumed_run_equals_an_unbroken_one(tmp_path: Path) -> None:
@@ -92,6 +92,26 @@ def test_a_resumed_run_equals_an_unbroken_one(tmp_path: Path) -> None:
     other = load_model(tmp_path / "broken" / "weights.safetensors").state_dict()
     for name, tensor in one.items():
         torch.testing.assert_close(other[name], tensor, rtol=1e-4, atol=1e-5)
+
+
+def test_a_run_stopped_by_hand_loses_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, calls = fit_module._step, []
+
+    def stops_at_the_fourth(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return step(*arguments)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit_module, "_step", stops_at_the_fourth)
+        with pytest.raises(KeyboardInterrupt):
+            fit(CONFIG, tmp_path / "run", Start())
+    content = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert content["step"] == 3
+    fit(CONFIG, tmp_path / "run", Start(resume=True))
 
 
 def test_weights_alone_continue_the_schedule(tmp_path: Path) -> None:

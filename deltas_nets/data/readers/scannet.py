@@ -27,7 +27,8 @@ _NO_POSE = "repair it or take the frame out of the view sets"
 
 def recognises(path: Path) -> bool:
     """Whether this folder, or a folder of scenes inside it, is laid out this way."""
-    return _is_scene(path) or any((path / name).is_dir() for name in NESTING)
+    nested = any((path / name).is_dir() for name in NESTING)
+    return nested or _is_scene(path) or any(map(_is_scene, path.iterdir()))
 
 
 def read(path: Path) -> Capture:
@@ -122,11 +123,11 @@ def _find_scene(path: Path) -> Path:
     """The folder that holds color/ and pose/: this one, or the only scene inside."""
     scene = path
     if not _is_scene(path):
-        nests = [path / name for name in NESTING if (path / name).is_dir()]
+        nests = [path, *(path / name for name in NESTING if (path / name).is_dir())]
         scenes = sorted(child for nest in nests for child in nest.iterdir() if _is_scene(child))
         if not scenes:
             remedy = "put the folders color, pose and intrinsic into a folder of it"
-            raise UserError("there is no scene inside", nests[0], remedy)
+            raise UserError("there is no scene inside", nests[-1], remedy)
         if len(scenes) > 1:
             names = ", ".join(str(scene.relative_to(path)) for scene in scenes[:5])
             more = f" and {len(scenes) - 5} more" if len(scenes) > 5 else ""
