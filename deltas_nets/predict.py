@@ -17,8 +17,8 @@ from deltas_nets.data.view_sets import ViewSet
 from deltas_nets.network.deltas import Deltas, DepthPrediction
 from deltas_nets.outputs import OutputFolder
 
-WORK_PIXELS = 224 * 304
-"""Pixels of the image that the network sees, unless a size is given."""
+WORK_PIXELS = 120_000
+"""Pixels of the image that the network sees, unless a size is given; see decision 5."""
 
 
 @dataclass(frozen=True)
