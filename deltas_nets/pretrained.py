@@ -1,5 +1,6 @@
 """Weights in files: the shipped ones by name, others by path; safetensors only."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from importlib.resources import files
@@ -77,6 +78,17 @@ def read_metadata(file: Path) -> dict[str, str]:
             "name the weights.safetensors that deltas train wrote",
         ) from None
     return metadata or {}
+
+
+def weights_record(name: str) -> dict[str, str]:
+    """What identifies weights by name or file, and where they come from."""
+    file = weights_file(name)
+    metadata = read_metadata(file)
+    record = {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    for key in ("step", "seed", "data", "origin"):
+        if key in metadata:
+            record[key] = metadata[key]
+    return record
 
 
 def load_weights(model: torch.nn.Module, file: Path) -> None:

