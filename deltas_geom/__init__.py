@@ -27,9 +27,12 @@ from deltas_geom.pixels import (
 from deltas_geom.poses import camera_centers, invert_pose, is_rigid, relative_pose
 from deltas_geom.projection import Projection, pixel_rays, project, unproject
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
+from deltas_geom.rays import triangulate_rays
+from deltas_geom.refine import Refined, refine_points
 from deltas_geom.sampling import Samples, sample_inv_depths, sample_map, sample_segments
 from deltas_geom.segments import Segments, epipolar_segments
 from deltas_geom.status import Status
+from deltas_geom.tracks import TriangulatedTracks, triangulate_tracks
 from deltas_geom.triangulation import Triangulation, triangulate, triangulate_points
 from deltas_geom.uncertainty import point_covariance, ray_parallax, reprojection_residual
 from deltas_geom.views import PosedViews
@@ -40,12 +43,14 @@ __all__ = [
     "Matches",
     "PosedViews",
     "Projection",
+    "Refined",
     "Samples",
     "Segments",
     "ShapeError",
     "SoftArgmax",
     "SparseDepth",
     "Status",
+    "TriangulatedTracks",
     "Triangulation",
     "Triangulator",
     "camera_centers",
@@ -68,6 +73,7 @@ __all__ = [
     "project",
     "rasterize_depth",
     "ray_parallax",
+    "refine_points",
     "relative_pose",
     "reprojection_residual",
     "resize_intrinsics",
@@ -79,5 +85,7 @@ __all__ = [
     "to_homogeneous",
     "triangulate",
     "triangulate_points",
+    "triangulate_rays",
+    "triangulate_tracks",
     "unproject",
 ]

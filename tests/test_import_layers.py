@@ -25,16 +25,24 @@ ORDER = [
     "null_vector",
     "uncertainty",
     "triangulation",
+    "refine",
+    "rays",
+    "tracks",
     "rasterize",
     "modules",
 ]
 ALLOWED = {"torch", "kornia", "numpy", "deltas_geom", *sys.stdlib_module_names}
 
 
-def imports(path: Path) -> set[str]:
-    """Every module that a file imports, wherever in the file."""
+def imports(path: Path, *, at_once: bool = False) -> set[str]:
+    """Every module that a file imports, wherever in the file; ``at_once``: outside functions."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    later = {inner for node in functions for inner in ast.walk(node)} if at_once else set()
+    for node in ast.walk(tree):
+        if node in later:
+            continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -54,8 +62,11 @@ def test_every_file_has_its_place_in_the_order() -> None:
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: path.stem)
 def test_deltas_geom_stands_on_torch_and_kornia_alone(path: Path) -> None:
-    allowed = ALLOWED | ({"hypothesis"} if path.parent.name == "testing" else set())
+    testing = path.parent.name == "testing"
+    allowed = ALLOWED | ({"hypothesis", "cv2"} if testing else set())
     assert {name.split(".")[0] for name in imports(path)} <= allowed
+    # OpenCV only when asked for: it is in the extra "test".
+    assert "cv2" not in {name.split(".")[0] for name in imports(path, at_once=True)}
 
 
 @pytest.mark.parametrize("name", ORDER)
@@ -67,7 +78,7 @@ def test_a_file_imports_only_files_above_it(name: str) -> None:
 
 def test_importing_deltas_geom_is_light() -> None:
     check = (
-        "import sys, deltas_geom, deltas_geom.testing\n"
+        "import sys, deltas_geom, deltas_geom.testing, deltas_geom.testing.conformance\n"
         "loaded = {name.split('.')[0] for name in sys.modules}\n"
         "print(*loaded & {'matplotlib', 'skimage', 'hypothesis', 'cv2', 'deltas_nets'})"
     )
