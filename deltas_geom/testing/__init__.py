@@ -1,7 +1,7 @@
-"""Scenes and hypothesis strategies, for our tests and for yours.
+"""Scenes, hypothesis strategies and invariants, for our tests and for yours.
 
-``scenes`` needs torch alone; ``strategies`` needs hypothesis (the extra ``test``), so it is
-not imported here.
+``scenes`` and ``invariants`` need torch alone; ``strategies`` needs hypothesis (the extra
+``test``), so it is not imported here.
 """
 
 from deltas_geom.testing.scenes import (
