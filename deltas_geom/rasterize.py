@@ -97,6 +97,8 @@ def _footprint(pixels: Tensor, splat: str) -> tuple[Tensor, Tensor, Tensor]:
     corner = pixels.floor()
     x, y = (pixels - corner).unbind(dim=-1)
     shares = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=-1)
+    # Less than rounding of the whole is no share: a mean over it alone has gradients without bound.
+    shares = torch.where(shares > torch.finfo(shares.dtype).eps, shares, 0.0)
     column, row = corner.long().unbind(dim=-1)
     columns = torch.stack([column, column + 1, column, column + 1], dim=-1)
     rows = torch.stack([row, row, row + 1, row + 1], dim=-1)

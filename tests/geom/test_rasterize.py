@@ -164,6 +164,17 @@ def test_no_finite_input_gives_nan_or_inf(
             assert gradient is None or gradient.isfinite().all()
 
 
+def test_a_share_below_rounding_is_no_share() -> None:
+    pixels = torch.tensor([[0.0, 0.0], [0.0, 1e-30]], requires_grad=True)
+    depth = torch.tensor([1.0, 3e4], requires_grad=True)
+    weights = torch.tensor([1.8e4, 1.0], requires_grad=True)
+    sparse = rasterize((pixels, depth, weights), ("mean", "bilinear"))
+    assert (sparse.weight > 0).sum() == 1
+    total = sparse.depth.sum() + sparse.weight.sum()
+    for gradient in torch.autograd.grad(total, (pixels, depth, weights)):
+        assert gradient.isfinite().all()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_right(kind: tuple[str, str]) -> None:
     generator = torch.Generator().manual_seed(0)
