@@ -5,16 +5,17 @@ Conventions: OpenCV axes, ``cam_from_world``, pixel centres at integers, metres.
 """
 
 from deltas_geom.checks import ShapeError
+from deltas_geom.correlation import correlate, correlate_normalized
 from deltas_geom.fundamental import epipolar_distance, epipolar_lines, fundamental_between
 from deltas_geom.homogeneous import from_homogeneous, to_homogeneous
 from deltas_geom.matching import (
     Matches,
     SoftArgmax,
-    correlate,
     match_joint,
     match_per_view,
     soft_argmax,
 )
+from deltas_geom.midpoint import triangulate_inverse_depth_weighted, triangulate_midpoint
 from deltas_geom.modules import DepthRasterizer, EpipolarSampler, Triangulator
 from deltas_geom.pixels import (
     crop_intrinsics,
@@ -29,12 +30,19 @@ from deltas_geom.projection import Projection, pixel_rays, project, unproject
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
 from deltas_geom.rays import triangulate_rays
 from deltas_geom.refine import Refined, refine_points
+from deltas_geom.robust import RobustTriangulation, triangulate_robust
 from deltas_geom.sampling import Samples, sample_inv_depths, sample_map, sample_segments
 from deltas_geom.segments import Segments, epipolar_segments
 from deltas_geom.status import Status
 from deltas_geom.tracks import TriangulatedTracks, triangulate_tracks
 from deltas_geom.triangulation import Triangulation, triangulate, triangulate_points
-from deltas_geom.uncertainty import point_covariance, ray_parallax, reprojection_residual
+from deltas_geom.two_view import TwoViewTriangulation, triangulate_two_view
+from deltas_geom.uncertainty import (
+    depth_variance,
+    point_covariance,
+    ray_parallax,
+    reprojection_residual,
+)
 from deltas_geom.views import PosedViews
 
 __all__ = [
@@ -44,6 +52,7 @@ __all__ = [
     "PosedViews",
     "Projection",
     "Refined",
+    "RobustTriangulation",
     "Samples",
     "Segments",
     "ShapeError",
@@ -53,9 +62,12 @@ __all__ = [
     "TriangulatedTracks",
     "Triangulation",
     "Triangulator",
+    "TwoViewTriangulation",
     "camera_centers",
     "correlate",
+    "correlate_normalized",
     "crop_intrinsics",
+    "depth_variance",
     "epipolar_distance",
     "epipolar_lines",
     "epipolar_segments",
@@ -84,8 +96,12 @@ __all__ = [
     "soft_argmax",
     "to_homogeneous",
     "triangulate",
+    "triangulate_inverse_depth_weighted",
+    "triangulate_midpoint",
     "triangulate_points",
     "triangulate_rays",
+    "triangulate_robust",
     "triangulate_tracks",
+    "triangulate_two_view",
     "unproject",
 ]

@@ -1,4 +1,4 @@
-"""Correlation along epipolar samples, soft-argmax, and matches of both kinds.
+"""Soft-argmax over samples, and matches of both kinds.
 
 `match_per_view` decides in each source alone, as the paper does. `match_joint` averages the
 evidence of all sources at common inverse depths before it decides, so that one wrong mode in
@@ -8,16 +8,12 @@ one view cannot pull the point away.
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.pixels import normalize_pixels
 from deltas_geom.sampling import Samples, sample_inv_depths
 from deltas_geom.views import PosedViews
-
-_CACHED_ELEMENTS = 1 << 18  # elements of one view's correlation maps in a chunk: 1 MB
 
 
 class Matches(NamedTuple):
@@ -52,56 +48,6 @@ class SoftArgmax(NamedTuple):
     peak: Tensor
     mass: Tensor
     entropy: Tensor
-
-
-def correlate(
-    descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
-) -> Tensor:
-    """Dot products of keypoint descriptors with the sources' features at samples.
-
-    Correlation comes first and the scalar map is sampled: bilinear reading is linear, so the
-    result is that of reading D channels and then multiplying, at a fraction of the memory.
-
-    Args:
-        descriptors: ``(*B, N, D)`` of the anchor's keypoints.
-        feature_map: ``(*B, V-1, D, h, w)`` of the sources, any stride.
-        samples: places in the sources.
-        image_size: (height, width) of the sources' images.
-
-    Returns:
-        ``(*B, V-1, N, O, S)``; 0 where the sample is masked.
-
-    Raises:
-        ShapeError: a trailing shape differs.
-
-    Source: the paper, equation 1.
-    """
-    check_shapes(
-        descriptors=(descriptors, "N D"),
-        feature_map=(feature_map, "S D h w"),
-        samples=(samples.pixels, "S N O M 2"),
-    )
-    batch = batch_shape(
-        (*descriptors.shape[:-2], 1), feature_map.shape[:-3], samples.pixels.shape[:-4]
-    )
-    height, width = feature_map.shape[-2:]
-    features = feature_map.flatten(-2)
-    grid = normalize_pixels(samples.pixels, image_size=image_size).to(features.dtype)
-    grid = grid.expand(*batch, *grid.shape[-4:])
-    read = [grid.new_zeros(*batch, 0, *grid.shape[-3:-1])]
-    # A chunk of correlation maps should stay in the cache between writing and sampling it.
-    chunk = max(8, _CACHED_ELEMENTS // (height * width))
-    for first in range(0, descriptors.shape[-2], chunk):
-        some = slice(first, first + chunk)
-        maps = descriptors[..., some, :].unsqueeze(-3) @ features
-        maps = maps.expand(*batch, *maps.shape[-2:]).reshape(-1, 1, height, width)
-        places = grid[..., some, :, :, :]
-        scores = F.grid_sample(
-            maps, places.flatten(0, -4), padding_mode="border", align_corners=False
-        )
-        read.append(scores.reshape(places.shape[:-1]))
-    correlation = torch.cat(read, dim=-3)
-    return torch.where(samples.mask, correlation, 0.0)
 
 
 def soft_argmax(
@@ -176,7 +122,7 @@ def match_per_view(
 
     Args:
         keypoints: ``(*B, N, 2)`` of the anchor.
-        scores: ``(*B, V-1, N, O, S)`` logits, for example a scaled :func:`correlate`.
+        scores: ``(*B, V-1, N, O, S)`` logits, for example a scaled :func:`deltas_geom.correlate`.
         samples: the places scored.
         window: see :func:`soft_argmax`; only without offsets (O = 1).
 

@@ -3,15 +3,15 @@
 A batch of matrices is a struct of arrays: ten tensors of any common shape, the upper triangle
 row by row. Elementwise arithmetic over the batch is an order of magnitude faster than a
 batched SVD, never raises and compiles. The route is LDL with the last coordinate eliminated
-last (robust to the world's unit and origin), one inverse iteration and one Rayleigh quotient
-iteration; gradients come from one more Rayleigh step, solved in the complement of the vector,
-where they stay finite when other eigenvalues meet (there SVD's are NaN). Where the vector
-itself is not unique, no division by a vanishing pivot happens and the caller is told.
+last (robust to the world's unit and origin), inverse iterations and one Rayleigh quotient
+iteration. Gradients come from one more Rayleigh step, solved in the complement of the vector,
+where they stay finite when other eigenvalues meet (there SVD's are NaN).
 
-Source: Golub and Van Loan, 4th ed., sections 4.1 and 8.2; the step is cubically convergent,
-so its first and second derivatives at the solution are exact.
+Source: Golub and Van Loan, 4th ed., sections 4.1, 8.1.4 (inertia) and 8.2; the step is cubically
+convergent, so its first and second derivatives at the solution are exact.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -21,41 +21,100 @@ Symmetric4 = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 """m00 m01 m02 m03 m11 m12 m13 m22 m23 m33."""
 Vector4 = tuple[Tensor, Tensor, Tensor, Tensor]
 
+_INVERSE_ITERATIONS = 3  # one is enough for good matches; gross outliers bring eigenvalues near
+
 
 class NullVector(NamedTuple):
     """A null vector and whether it is one.
 
     Attributes:
-        vector: unit, differentiable; the last coordinate is not negative. Finite wherever the
-            matrix is.
+        vector: of any length and sign, without gradient. Not finite at worst where not simple.
         simple: bool; False where the smallest eigenvalue is not apart from the others by more
-            than rounding (the vector is then arbitrary).
+            than rounding (the vector is then arbitrary), or the matrix is not finite.
     """
 
     vector: Vector4
     simple: Tensor
 
 
-def null_vector(matrix: Symmetric4) -> NullVector:
-    """Unit vector x that minimises x^T M x, differentiable in M.
+@torch.no_grad()
+def null_vector(
+    matrix: Symmetric4,
+    *,
+    product: Callable[[Vector4], Vector4] | None = None,
+    polish: int = 0,
+) -> NullVector:
+    """Vector x that minimises x^T M x / x^T x.
 
     Args:
-        matrix: positive semidefinite, finite, trace about 1.
+        matrix: positive semidefinite.
+        product: M x, computed more exactly than from M: for M = A^T A, A^T (A x).
+        polish: corrections by ``product``, each of which takes the vector from the accuracy that
+            M allows nearer to that of A.
     """
-    with torch.no_grad():
-        near = _inverse_iteration(matrix)
-        nearer = _rayleigh(matrix, near)
-        # Rayleigh iteration may leave for the next eigenvector, where the quotient is larger.
-        better = dot(nearer, multiply(matrix, nearer)) <= dot(near, multiply(matrix, near))
-        x0, x1, x2, x3 = (torch.where(better, b, a) for a, b in zip(near, nearer, strict=True))
-        start = (x0, x1, x2, x3)
-        converged = dot(start, start).isfinite()
-        x0, x1, x2, x3 = (torch.where(converged, component, 0.0) for component in start)
-        start = (x0, x1, x2, torch.where(converged, x3, 1.0))
-    step, definite = _rayleigh_step(matrix, start)
-    sign = torch.where(step[3] < 0, -1.0, 1.0).to(step[3].dtype)
-    vector = (step[0] * sign, step[1] * sign, step[2] * sign, step[3] * sign)
-    return NullVector(vector, converged & definite)
+    noise = rounding(matrix)
+    # Above the null space by the rounding of M, every pivot is positive.
+    factors = _factor(_shifted(matrix, -noise))
+    one = torch.ones_like(noise)
+    x = (0.13 * one, 0.07 * one, 0.11 * one, one)
+    for _ in range(_INVERSE_ITERATIONS):
+        x = _solve_scaled(factors, x)
+    x = unit(x)  # before it overflows: towards infinity each solve makes it longer
+    near = _solve_scaled(factors, x)
+    quotient = _quotient(factors, near, x) - noise
+
+    factors = _factor(_shifted(matrix, quotient))
+    nearer = _solve_scaled(factors, near)
+    nearer_quotient = quotient + _quotient(factors, nearer, near)
+    # The iteration may leave for the next eigenvector, where the quotient is larger. A pivot
+    # that happens to vanish makes it NaN, which is not smaller either.
+    better = nearer_quotient <= quotient
+    x0, x1, x2, x3 = (torch.where(better, b, a) for a, b in zip(near, nearer, strict=True))
+    quotient = torch.where(better, nearer_quotient, quotient)
+
+    # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
+    factors = _factor(_shifted(matrix, quotient + noise))
+    i0, i1, i2, d3 = factors[:4]
+    simple = i0.sign() + i1.sign() + i2.sign() + d3.sign() == 2
+    vector = _solve_scaled(factors, (x0, x1, x2, x3))
+    if product is not None:
+        for _ in range(polish):
+            vector = _polished(factors, unit(vector), product)
+    return NullVector(vector, simple)
+
+
+def _polished(factors: "_Factors", x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
+    """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
+    image = product(x)
+    mu = dot(x, image)
+    g0, g1, g2, g3 = (_less(image[i], mu, x[i]) for i in range(4))
+    inverse = 1 / factors[3]
+    scaled = _solve_scaled(factors, (g0, g1, g2, g3))
+    # What the solve amplifies is along x, and goes.
+    along = dot(x, scaled)
+    x0, x1, x2, x3 = (_less(x[i], inverse, _less(scaled[i], along, x[i])) for i in range(4))
+    return x0, x1, x2, x3
+
+
+def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
+    """x - (M - mu)^+ (M x), mu = x^T M x: the null vector with its derivatives.
+
+    Args:
+        matrix: positive semidefinite, finite.
+        x: its null vector, of unit length and without gradient.
+
+    Returns:
+        Of about unit length. Where M - mu is not definite in the complement of x, x itself.
+    """
+    image = multiply(matrix, x)
+    change = _solve_in_complement(matrix, x, dot(x, image), image)
+    return x[0] - change[0], x[1] - change[1], x[2] - change[2], x[3] - change[3]
+
+
+def rounding(matrix: Symmetric4) -> Tensor:
+    """What rounding of the entries may do to an eigenvalue; without gradient."""
+    m00, _, _, _, m11, _, _, m22, _, m33 = (entry.detach() for entry in matrix)
+    return (64 * torch.finfo(m00.dtype).eps) * (m00 + m11 + m22 + m33)
 
 
 def multiply(matrix: Symmetric4, x: Vector4) -> Vector4:
@@ -77,38 +136,39 @@ def dot(a: Vector4, b: Vector4) -> Tensor:
     return total
 
 
+def unit(x: Vector4) -> Vector4:
+    """x / |x|."""
+    scale = torch.rsqrt(dot(x, x))
+    return x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale
+
+
 def _less(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """a - b c in one pass over memory, which is what this file costs."""
     return torch.addcmul(a, b, c, value=-1)
 
 
-def _unit(x: Vector4) -> Vector4:
-    scale = torch.rsqrt(dot(x, x))
-    return (x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale)
+def _shifted(matrix: Symmetric4, shift: Tensor) -> Symmetric4:
+    """M - shift."""
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
+    return m00 - shift, m01, m02, m03, m11 - shift, m12, m13, m22 - shift, m23, m33 - shift
 
 
-_INVERSE_ITERATIONS = 3
 _Factors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def _factor(matrix: Symmetric4) -> _Factors:
     """LDL^T: inverse pivots 0..2, the last pivot, and l10 l20 l30 l21 l31 l32."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
-    i0 = 1 / _nudged(m00)
+    i0 = 1 / m00
     l10, l20, l30 = m01 * i0, m02 * i0, m03 * i0
-    i1 = 1 / _nudged(_less(m11, l10, m01))
+    i1 = 1 / _less(m11, l10, m01)
     t21, t31 = _less(m12, l20, m01), _less(m13, l30, m01)
     l21, l31 = t21 * i1, t31 * i1
-    i2 = 1 / _nudged(_less(_less(m22, l20, m02), l21, t21))
+    i2 = 1 / _less(_less(m22, l20, m02), l21, t21)
     t32 = _less(_less(m23, l30, m02), l31, t21)
     l32 = t32 * i2
     d3 = _less(_less(_less(m33, l30, m03), l31, t31), l32, t32)
     return i0, i1, i2, d3, l10, l20, l30, l21, l31, l32
-
-
-def _nudged(pivot: Tensor) -> Tensor:
-    """The pivot, moved off zero by rounding: inverse iteration then still finds the vector."""
-    return torch.where(pivot == 0, torch.finfo(pivot.dtype).eps, pivot)
 
 
 def _solve_scaled(factors: _Factors, b: Vector4) -> Vector4:
@@ -124,42 +184,13 @@ def _solve_scaled(factors: _Factors, b: Vector4) -> Vector4:
     return z0, z1, z2, z3
 
 
-def _inverse_iteration(matrix: Symmetric4) -> Vector4:
-    factors = _factor(matrix)
-    _, _, _, _, l10, l20, l30, l21, l31, l32 = factors
-    # M^-1 e4 up to scale is the inhomogeneous solution, a start that is nearly right.
-    z2 = -l32
-    z1 = -l31 - l21 * z2
-    z0 = -l30 - l10 * z1 - l20 * z2
-    x0, x1, x2, x3 = _unit((z0, z1, z2, torch.ones_like(z0)))
-    # The nudge reaches vectors near infinity, to which e4 is nearly or exactly orthogonal.
-    x = (x0 + 0.13, x1 + 0.07, x2 + 0.11, x3)
-    # Once is enough for good matches; gross outliers bring the next eigenvalue near.
-    for _ in range(_INVERSE_ITERATIONS):
-        x = _unit(_solve_scaled(factors, x))
-    return x
+def _quotient(factors: _Factors, x: Vector4, before: Vector4) -> Tensor:
+    """x^T M x / x^T x for x = ``_solve_scaled(factors, before)``."""
+    return factors[3] * dot(x, before) / dot(x, x)
 
 
-def _rayleigh(matrix: Symmetric4, x: Vector4) -> Vector4:
-    """One Rayleigh quotient iteration."""
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
-    shift = dot(x, multiply(matrix, x))
-    shifted = (m00 - shift, m01, m02, m03, m11 - shift, m12, m13, m22 - shift, m23, m33 - shift)
-    return _unit(_solve_scaled(_factor(shifted), x))
-
-
-def _rayleigh_step(matrix: Symmetric4, x: Vector4) -> tuple[Vector4, Tensor]:
-    """x - (M - mu)^+ (M x), mu = x^T M x: what autograd differentiates; and whether it may."""
-    image = multiply(matrix, x)
-    change, definite = _solve_in_complement(matrix, x, dot(x, image), image)
-    step = _unit((x[0] - change[0], x[1] - change[1], x[2] - change[2], x[3] - change[3]))
-    return step, definite
-
-
-def _solve_in_complement(
-    matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4
-) -> tuple[Vector4, Tensor]:
-    """(M - mu)^+ g in the 3-space orthogonal to the unit vector x; is M - mu definite there?
+def _solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) -> Vector4:
+    """(M - mu)^+ g in the 3-space orthogonal to the unit vector x.
 
     A Householder reflection takes x to the last axis; what is left is a definite 3x3 system.
     Where it is not, 0 is returned, with no gradient.
@@ -171,37 +202,39 @@ def _solve_in_complement(
     u = (x0, x1, x2, x3 + sign)
     image = multiply(matrix, u)
     half = beta * beta * 0.5 * dot(u, image)
-    q0, q1, q2 = (beta * image[i] - half * u[i] for i in range(3))
-    a00 = m00 - 2 * x0 * q0 - mu
-    a01 = m01 - x0 * q1 - q0 * x1
-    a02 = m02 - x0 * q2 - q0 * x2
-    a11 = m11 - 2 * x1 * q1 - mu
-    a12 = m12 - x1 * q2 - q1 * x2
-    a22 = m22 - 2 * x2 * q2 - mu
+    q0, q1, q2 = (_less(beta * image[i], half, u[i]) for i in range(3))
+    a00 = _less(m00 - mu, 2 * x0, q0)
+    a01 = _less(_less(m01, x0, q1), q0, x1)
+    a02 = _less(_less(m02, x0, q2), q0, x2)
+    a11 = _less(m11 - mu, 2 * x1, q1)
+    a12 = _less(_less(m12, x1, q2), q1, x2)
+    a22 = _less(m22 - mu, 2 * x2, q2)
     reflect = beta * dot(u, g)
-    h0, h1, h2 = g[0] - reflect * x0, g[1] - reflect * x1, g[2] - reflect * x2
+    h0, h1, h2 = _less(g[0], reflect, x0), _less(g[1], reflect, x1), _less(g[2], reflect, x2)
 
-    # Rounding of the entries, whose trace is about 1, reaches the pivots.
-    noise = 64 * torch.finfo(mu.dtype).eps
+    noise = rounding(matrix)
     i0, definite0 = _reciprocal(a00, noise)
     l10, l20 = a01 * i0, a02 * i0
-    i1, definite1 = _reciprocal(a11 - l10 * a01, noise)
-    t = a12 - l20 * a01
+    i1, definite1 = _reciprocal(_less(a11, l10, a01), noise)
+    t = _less(a12, l20, a01)
     l21 = t * i1
-    i2, definite2 = _reciprocal(a22 - l20 * a02 - l21 * t, noise)
+    i2, definite2 = _reciprocal(_less(_less(a22, l20, a02), l21, t), noise)
     definite = definite0 & definite1 & definite2
-    h1 = h1 - l10 * h0
-    h2 = (h2 - l20 * h0 - l21 * h1) * i2
-    h1 = h1 * i1 - l21 * h2
-    h0 = h0 * i0 - l10 * h1 - l20 * h2
+    h1 = _less(h1, l10, h0)
+    h2 = _less(_less(h2, l20, h0), l21, h1) * i2
+    h1 = _less(h1 * i1, l21, h2)
+    h0 = _less(_less(h0 * i0, l10, h1), l20, h2)
 
     reflect = beta * (x0 * h0 + x1 * h1 + x2 * h2)
-    solution = (h0 - reflect * u[0], h1 - reflect * u[1], h2 - reflect * u[2], -reflect * u[3])
+    solution = (
+        _less(h0, reflect, u[0]), _less(h1, reflect, u[1]), _less(h2, reflect, u[2]),
+        -reflect * u[3],
+    )  # fmt: skip
     s0, s1, s2, s3 = (torch.where(definite, component, 0.0) for component in solution)
-    return (s0, s1, s2, s3), definite
+    return s0, s1, s2, s3
 
 
-def _reciprocal(pivot: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+def _reciprocal(pivot: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """1 / pivot, and whether it is positive beyond rounding; elsewhere 1, with no gradient."""
     positive = pivot > noise
     return 1 / torch.where(positive, pivot, 1.0), positive

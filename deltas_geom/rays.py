@@ -11,16 +11,30 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import check_shapes
+from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.null_vector import Symmetric4, null_vector
+from deltas_geom.null_vector import Symmetric4, Vector4
+from deltas_geom.observations import (
+    Vector3,
+    Weights,
+    check_weights,
+    solver_dtype,
+    weigh,
+)
 from deltas_geom.poses import camera_centers
+from deltas_geom.rig_frame import (
+    FoundPoints,
+    RigFrame,
+    derivable_points,
+    find_points,
+    judge_points,
+    kept,
+    rig_frames,
+)
 from deltas_geom.status import Status
 from deltas_geom.triangulation import Triangulation
-from deltas_geom.uncertainty import ray_parallax, solver_dtype
-
-# As in triangulation: squared and times a small parallax, less would be lost in rounding.
-_NEGLIGIBLE_WEIGHT = 1e-6
+from deltas_geom.uncertainty import parallax_of
 
 
 def triangulate_rays(
@@ -59,43 +73,47 @@ def triangulate_rays(
         tensor([[0.2000, 0.1000, 2.0000]])
     """
     check_shapes(cam_from_world=(cam_from_world, "V 4 4"), rays=(rays, "V N 3"))
-    seen = _see(cam_from_world, rays, weights, mask)
-    frame = _frame(seen)
-    normal = _normal_matrix(seen, frame)
-    found = solve_points(normal, frame, eps=torch.finfo(rays.dtype).eps)
+    check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
 
-    # Distance along the ray and the angle to it, of what is not yet known to be in front.
-    offset = found.points.unsqueeze(-3) - seen.centers[..., None]  # (*B, V, 3, N)
-    along = (seen.directions * offset).sum(dim=-2)
-    size = torch.maximum(found.points.abs().amax(dim=-2), along.abs().amax(dim=-2)).detach()
-    # At a camera's centre, within rounding, a point has no angle.
-    least = 64 * torch.finfo(along.dtype).eps * torch.maximum(size, frame.farthest)
-    status = judge_points(
-        found,
-        in_front=((along > least.unsqueeze(-2)) | ~seen.used).all(dim=-2),
-        size=size,
-        largest=torch.finfo(rays.dtype).max,
-        enough=seen.enough,
-        finite=seen.finite,
-    )
-    valid = status == Status.OK
-    used = seen.used & valid.unsqueeze(-2)
-    points = torch.where(valid.unsqueeze(-2), found.points, 0.0).mT.to(rays.dtype)
-    depth = torch.where(valid.unsqueeze(-2), along, 0.0).to(rays.dtype)
+    def known(seen: _Seen, points: Vector3, status: Tensor) -> tuple[Tensor, ...]:
+        valid = (status == Status.OK.value).unsqueeze(-2)
+        used = ~seen.weights.unused & valid
+        along = _along(seen, points)
+        angle = _angle(seen, points, along, used)
+        squared = torch.where(used, seen.weights.squared, 0.0)
+        total = squared.sum(dim=-2)
+        mean = safe_divide((squared * angle.square()).sum(dim=-2), total, total > 0)
+        positive = mean > 0
+        # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
+        residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
+        depth = torch.where(valid, along, 0.0)
+        parallax = parallax_of(seen.centers, points, used.to(along.dtype))
+        limit = torch.finfo(rays.dtype).max
+        outward = (
+            found.to(rays.dtype).clamp(-limit, limit)
+            for found in (torch.stack(points, dim=-1), depth, residual, parallax)
+        )
+        return (*outward, status)
 
-    across = torch.linalg.cross(seen.directions.expand_as(offset), offset, dim=-2)
-    squared_across = across.square().sum(dim=-2)
-    moved = used & (squared_across > 0)
-    # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
-    sine = torch.where(moved, torch.where(moved, squared_across, 1.0).sqrt(), 0.0)
-    angle = torch.atan2(sine, torch.where(used, along, 1.0))
-    total = seen.squared.sum(dim=-2)
-    mean = safe_divide((seen.squared * angle.square()).sum(dim=-2), total, valid & (total > 0))
-    positive = valid & (mean > 0)
-    residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
-    poses = torch.where(seen.known_pose[..., None, None], cam_from_world, 0.0).detach()
-    parallax = ray_parallax(poses[..., :3, :], points, used)
-    return Triangulation(points, depth, status, valid, residual.to(rays.dtype), parallax, None)
+    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
+        posed = _pose(*inputs)
+        found, status = _find(posed)
+        points = kept(found.points, posed.around, status == Status.OK.value)
+        return known(posed.seen, points, status)
+
+    def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
+        posed = _pose(*inputs)
+        found, status = _find(posed)
+        valid = status == Status.OK.value
+        near = derivable_points(posed.normal, posed.frame, found.vector, valid)
+        return known(posed.seen, kept(near, posed.around, valid), status)
+
+    cut = ((rays, -2), (weights, -1), (mask, -1))
+    dims = (-2, -1, -1, -1, -1)
+    found = in_chunks(derivable, values, cam_from_world, cut, dims=dims)
+    points, depth, residual, parallax, status = found
+    valid = status == Status.OK.value
+    return Triangulation(points, depth, status, valid, residual, parallax, None)
 
 
 class _Seen(NamedTuple):
@@ -103,115 +121,86 @@ class _Seen(NamedTuple):
 
     Attributes:
         centers: ``(*B, V, 3)`` of the cameras.
-        known_pose: ``(*B, V)`` the pose is finite.
-        directions: ``(*B, V, 3, N)`` unit, in the world; anything where unused.
-        squared: ``(*B, V, N)`` squared weights, largest 1; 0 where unused.
-        used: ``(*B, V, N)`` of points that may be solvable.
-        counts: ``(*B, V, N)`` the view's weight is not negligible beside the largest.
-        finite: ``(*B, N)`` everything used is.
-        enough: ``(*B, N)`` at least two views count.
+        sick: ``(*B, V)`` 1 for cameras that are not finite, else 0.
+        directions: ``(*B, V, 3, N)`` unit, in the world; anything where unsound.
+        weights: of the rays.
     """
 
     centers: Tensor
-    known_pose: Tensor
+    sick: Tensor
     directions: Tensor
-    squared: Tensor
-    used: Tensor
-    counts: Tensor
-    finite: Tensor
-    enough: Tensor
+    weights: Weights
 
 
 def _see(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> _Seen:
-    weight = torch.ones_like(rays[..., 0])
-    if weights is not None:
-        check_shapes(weights=(weights, "V N"), rays=(rays, "V N 3"))
-        weight = weight * weights
-    if mask is not None:
-        check_shapes(mask=(mask, "V N"), rays=(rays, "V N 3"))
-        weight = torch.where(mask, weight, 0.0)
     work = solver_dtype(rays)
-    batch = batch_shape(cam_from_world.shape[:-3], weight.shape[:-2])
-    weight = weight.to(work).expand(*batch, *weight.shape[-2:])
-    pose, ray = cam_from_world.to(work), rays.to(work).mT  # (*B, V, 3, N)
-
-    # Squares of what is let through can be represented. NaN is not let through.
-    limit = torch.finfo(work).max ** 0.25
-    known_pose = (pose[..., :3, :].abs() < limit).all(-1).all(-1)
-    length = ray.detach().abs().amax(dim=-2)
-    known = (length > 0) & length.isfinite() & weight.isfinite() & known_pose[..., None]
-    used = weight != 0  # NaN counts as used, and is caught as not finite
-    finite = (known | ~used).all(dim=-2)
-    size = torch.where(used, weight.detach().abs(), 0.0)
-    largest = size.amax(dim=-2, keepdim=True)
-    counts = used & (size > _NEGLIGIBLE_WEIGHT * largest)
-    enough = counts.sum(dim=-2) >= 2
-    used = used & (finite & enough).unsqueeze(-2)
-    share = weight / torch.where(largest > 0, largest, 1.0)
-
+    batch = check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
+    pose = cam_from_world.to(work)
+    ray = rays.mT.to(work, memory_format=torch.contiguous_format)  # (*B, V, 3, N)
+    with torch.no_grad():
+        # Squares of what is let through can be represented. NaN is not let through.
+        finite = (pose[..., :3, :].abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)
+        length = ray.abs().amax(dim=-2)
+        sound = (length > 0) & (length <= torch.finfo(work).max)
     # Double where throughout: what is not used must pass no gradient and no NaN.
-    pose = torch.where(known_pose[..., None, None], pose, 0.0)
-    # Divided twice: the largest coordinate cannot overflow when squared.
-    ray = torch.where(used.unsqueeze(-2), ray, 1.0)
-    ray = ray / torch.where(used, length, 1.0).unsqueeze(-2)
-    ray = ray / ray.square().sum(dim=-2, keepdim=True).sqrt()
+    pose = torch.where(finite[..., None, None], pose, 0.0)
+    # Divided by its largest coordinate it cannot overflow when squared.
+    ray = torch.where(sound.unsqueeze(-2), ray, 1.0)
+    ray = ray / torch.where(sound, length, 1.0).unsqueeze(-2)
+    direction = pose[..., :3, :3].mT @ ray
+    # A pose that is not finite turns it into nothing.
+    squared = direction.square().sum(dim=-2, keepdim=True)
     return _Seen(
         centers=camera_centers(pose),
-        known_pose=known_pose,
-        directions=pose[..., :3, :3].mT @ ray,
-        squared=torch.where(used, share, 0.0).square(),
-        used=used,
-        counts=counts,
-        finite=finite,
-        enough=enough,
+        sick=(~finite).to(work),
+        directions=direction * torch.where(squared > 0, squared, 1.0).rsqrt(),
+        weights=weigh(weights, mask, batch=batch, like=rays, sound=sound),
     )
 
 
-class RigFrame(NamedTuple):
-    """Where each of N points is solved: x = unit x' + origin.
+class _Posed(NamedTuple):
+    """The points' equations, in their frames.
 
     Attributes:
-        origin: ``(*B, 3, N)`` mean of the centres, weighted by the squared weights.
-        unit: ``(*B, N)`` their spread.
-        reach: ``(*B, N)`` largest distance of a centre that counts from the origin.
-        farthest: ``(*B, N)`` largest distance of a centre that counts from the world's origin.
-        posed: ``(*B, N)`` the inputs are finite and enough.
+        seen: the rays.
+        around: ``(*B, 1, 3)`` the origin of the sums, in the world.
+        offset: ``(*B, V, 3, N)`` of the frame's origin from the centres, in its units.
+        frame: of the points.
+        normal: ten ``(*B, N)``, in the frame.
+        dtype: of the inputs.
     """
 
-    origin: Tensor
-    unit: Tensor
-    reach: Tensor
-    farthest: Tensor
-    posed: Tensor
+    seen: _Seen
+    around: Tensor
+    offset: Tensor
+    frame: RigFrame
+    normal: Symmetric4
+    dtype: torch.dtype
 
 
-def _frame(seen: _Seen) -> RigFrame:
-    total = seen.squared.sum(dim=-2)
-    share = safe_divide(seen.squared, total.unsqueeze(-2), (total > 0).unsqueeze(-2))
-    # Its rounding, far from the world's origin, does no harm: any origin near by will do.
-    origin = seen.centers.mT @ share
-    apart = (seen.centers[..., None] - origin.unsqueeze(-3)).square().sum(dim=-2)  # (*B, V, N)
-    variance = (share * apart).sum(dim=-2)
-    unit = torch.where(variance > torch.finfo(variance.dtype).tiny, variance, 1.0).sqrt()
-    reach = torch.where(seen.counts, apart.detach(), 0.0).amax(dim=-2).sqrt()
-    from_world = seen.centers.detach().norm(dim=-1)[..., None]
-    farthest = torch.where(seen.counts, from_world, 0.0).amax(dim=-2)
-    return RigFrame(origin, unit, reach, farthest, seen.finite & seen.enough)
+def _pose(
+    cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> _Posed:
+    seen = _see(cam_from_world, rays, weights, mask)
+    eps = torch.finfo(rays.dtype).eps
+    around, frame = rig_frames(seen.centers, seen.weights, seen.sick, eps=eps)
+    centers = (seen.centers - around)[..., None]
+    origin = torch.stack(frame.origin, dim=-2).unsqueeze(-3)
+    offset = (origin - centers) / frame.unit.unsqueeze(-2).unsqueeze(-3)
+    normal = _normal_matrix(seen.directions, offset, seen.weights.squared)
+    return _Posed(seen, around, offset, frame, normal, rays.dtype)
 
 
-def _normal_matrix(seen: _Seen, frame: RigFrame) -> Symmetric4:
-    """Sum of w^2 P^T (1 - d d^T) P in each point's frame, P = [1 | -c']."""
-    center = seen.centers[..., None] - frame.origin.unsqueeze(-3)  # (*B, V, 3, N)
-    center = center / frame.unit.unsqueeze(-2).unsqueeze(-3)
-    d0, d1, d2 = seen.directions.unbind(dim=-2)
-    c0, c1, c2 = center.unbind(dim=-2)
-    w = seen.squared
-    # The part of the centre across the ray, -(1 - d d^T) c'.
+def _normal_matrix(directions: Tensor, offset: Tensor, squared: Tensor) -> Symmetric4:
+    """Sum of w^2 P^T (1 - d d^T) P, P = [1 | offset]."""
+    d0, d1, d2 = directions.unbind(dim=-2)
+    c0, c1, c2 = offset.unbind(dim=-2)
+    # The part of the offset across the ray.
     along = d0 * c0 + d1 * c1 + d2 * c2
-    a0, a1, a2 = d0 * along - c0, d1 * along - c1, d2 * along - c2
-    v0, v1, v2 = w * d0, w * d1, w * d2
+    a0, a1, a2 = c0 - d0 * along, c1 - d1 * along, c2 - d2 * along
+    w, v0, v1, v2 = squared, squared * d0, squared * d1, squared * d2
     entries = (
         w - v0 * d0, -v0 * d1, -v0 * d2, w * a0,
         w - v1 * d1, -v1 * d2, w * a1,
@@ -222,78 +211,51 @@ def _normal_matrix(seen: _Seen, frame: RigFrame) -> Symmetric4:
     return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
 
 
-class FoundPoints(NamedTuple):
-    """Points before they are judged.
+@torch.no_grad()
+def _find(posed: _Posed) -> tuple[FoundPoints, Tensor]:
+    """Points and their status, without gradient."""
 
-    Attributes:
-        points: ``(*B, 3, N)`` in the world; 0 where there is none.
-        posed: ``(*B, N)`` they have a place or a direction.
-        at_infinity: ``(*B, N)`` it is a direction.
-    """
+    def product(x: Vector4) -> Vector4:
+        return _product(posed, x)
 
-    points: Tensor
-    posed: Tensor
-    at_infinity: Tensor
-
-
-def solve_points(normal: Symmetric4, frame: RigFrame, *, eps: float) -> FoundPoints:
-    """Points whose normal matrices, ten ``(*B, N)``, are given in their rig frames.
-
-    Args:
-        normal: of rows in any unit.
-        frame: of the points.
-        eps: rounding of the inputs, relative.
-    """
-    # Centres closer together than the rounding of where they are do not differ.
-    posed = frame.posed & (frame.reach > 64 * eps * frame.farthest)
-    trace = (normal[0] + normal[4] + normal[7] + normal[9]).detach()
-    posed = posed & (trace > 0) & trace.isfinite()
-    scale = torch.where(posed, trace, 1.0)
-    easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.1)
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
-        torch.where(posed, entry / scale, constant)
-        for entry, constant in zip(normal, easy, strict=True)
-    )
-    matrix = (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33)
-    (x0, x1, x2, x3), simple = null_vector(matrix)
-    posed = posed & simple
-
-    # Far above the smallest number, so that the gradient of the division is finite.
-    divisible = x3 > torch.finfo(x3.dtype).tiny ** (1 / 3)
-    inverse = safe_divide(torch.ones_like(x3), x3, posed & divisible) * frame.unit
-    offset = torch.stack([x0, x1, x2], dim=-2) * inverse.unsqueeze(-2)
-    distance = offset.detach().square().sum(dim=-2).sqrt()
-    at_infinity = ~divisible | (16 * eps * distance > frame.reach)
-    where = (posed & ~at_infinity).unsqueeze(-2)
-    return FoundPoints(torch.where(where, offset + frame.origin, 0.0), posed, at_infinity)
+    polish = 2 if posed.dtype == torch.float64 else 0
+    eps = torch.finfo(posed.dtype).eps
+    found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
+    x, y, z = kept(found.points, posed.around, found.near)
+    along = _along(posed.seen, (x, y, z))
+    # At a camera's centre, within rounding, a point has no angle.
+    size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()).unsqueeze(-2)
+    size = size + posed.seen.centers.abs().amax(dim=-1)[..., None]
+    ahead = along - 64 * torch.finfo(along.dtype).eps * size
+    in_front = torch.where(posed.seen.weights.unused, 1.0, ahead).amin(dim=-2) > 0
+    held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
+    status = judge_points(found, posed.frame, in_front=in_front, representable=held)
+    return found, status
 
 
-def judge_points(
-    found: FoundPoints,
-    *,
-    in_front: Tensor,
-    size: Tensor,
-    largest: float,
-    enough: Tensor,
-    finite: Tensor,
-) -> Tensor:
-    """Status ``(*B, N)`` int8 of points.
+def _product(posed: _Posed, x: Vector4) -> Vector4:
+    """The normal matrix times x, from the rows: it is not squared."""
+    place = torch.stack(x[:3], dim=-2).unsqueeze(-3)
+    line = place + posed.offset * x[3].unsqueeze(-2).unsqueeze(-3)
+    directions = posed.seen.directions
+    across = line - directions * (directions * line).sum(dim=-2, keepdim=True)
+    across = across * posed.seen.weights.squared.unsqueeze(-2)
+    g0, g1, g2 = across.sum(dim=-3).unbind(dim=-2)
+    return g0, g1, g2, (across * posed.offset).sum(dim=-2).sum(dim=-2)
 
-    Args:
-        found: the points.
-        in_front: of all used views.
-        size: largest coordinate or depth.
-        largest: what the caller's type can hold.
-        enough: at least two views count.
-        finite: everything used is.
-    """
-    status = torch.zeros_like(in_front, dtype=torch.int8)
-    for failed, reason in (
-        (~in_front, Status.BEHIND_CAMERA),
-        (found.at_infinity | ~(size < largest), Status.AT_INFINITY),
-        (~found.posed, Status.NO_PARALLAX),
-        (~enough, Status.TOO_FEW_VIEWS),
-        (~finite, Status.NOT_FINITE_INPUT),
-    ):
-        status = torch.where(failed, torch.full_like(status, reason), status)
-    return status
+
+def _along(seen: _Seen, points: Vector3) -> Tensor:
+    """Distance along each ray, ``(*B, V, N)`` metres."""
+    offset = torch.stack(points, dim=-2).unsqueeze(-3) - seen.centers[..., None]
+    return (seen.directions * offset).sum(dim=-2)
+
+
+def _angle(seen: _Seen, points: Vector3, along: Tensor, used: Tensor) -> Tensor:
+    """Angle from each ray, ``(*B, V, N)`` rad."""
+    offset = torch.stack(points, dim=-2).unsqueeze(-3) - seen.centers[..., None]
+    across = torch.linalg.cross(seen.directions.expand_as(offset), offset, dim=-2)
+    squared = across.square().sum(dim=-2)
+    apart = used & (squared > 0)
+    # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
+    sine = torch.where(apart, torch.where(apart, squared, 1.0).sqrt(), 0.0)
+    return torch.atan2(sine, torch.where(used, along, 1.0))

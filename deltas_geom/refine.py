@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.uncertainty import solver_dtype
+from deltas_geom.observations import solver_dtype
 
 Loss = Literal["squared", "huber", "cauchy"]
 

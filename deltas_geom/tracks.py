@@ -11,13 +11,25 @@ from torch import Tensor
 
 from deltas_geom.checks import ShapeError, check_shapes
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.null_vector import Symmetric4
-from deltas_geom.rays import RigFrame, judge_points, solve_points
+from deltas_geom.null_vector import Symmetric4, Vector4
+from deltas_geom.observations import (
+    NEGLIGIBLE_WEIGHT,
+    Vector3,
+    projection_centers,
+    solver_dtype,
+)
+from deltas_geom.recompute import recomputed
+from deltas_geom.rig_frame import (
+    FoundPoints,
+    RigFrame,
+    camera_moments,
+    derivable_points,
+    find_points,
+    judge_points,
+    kept,
+    rig_frame,
+)
 from deltas_geom.status import Status
-from deltas_geom.uncertainty import projection_centers, solver_dtype
-
-# As in triangulation: squared and times a small parallax, less would be lost in rounding.
-_NEGLIGIBLE_WEIGHT = 1e-6
 
 
 class TriangulatedTracks(NamedTuple):
@@ -102,43 +114,44 @@ def triangulate_tracks(
     if num_points < 0:
         raise ValueError(f"num_points must not be negative, got {num_points}")
 
-    weight = torch.ones_like(pixels[:, 0]) if weights is None else weights
-    listed = _listed(proj, pixels, camera_index, point_index, num_points, weight)
-    frame = _frame(listed)
-    found = solve_points(_normal_matrix(listed, frame), frame, eps=torch.finfo(proj.dtype).eps)
+    def known(posed: _Posed, points: Vector3, status: Tensor) -> tuple[Tensor, ...]:
+        listed, valid = posed.listed, status == Status.OK.value
+        ok = _at(valid, listed.point)
+        x, y, depth = _project(listed.camera, _at(torch.stack(points), listed.point))
+        counts = ~listed.unused & ok
+        dx = safe_divide(x, depth, counts) - torch.where(counts, listed.x, 0.0)
+        dy = safe_divide(y, depth, counts) - torch.where(counts, listed.y, 0.0)
+        squared = torch.where(counts, listed.squared, 0.0)
+        errors = _sum(squared * (dx * dx + dy * dy), listed.point, num_points)
+        total = _sum(squared, listed.point, num_points)
+        mean = safe_divide(errors, total, total > 0)
+        positive = mean > 0
+        # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
+        residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
+        limit = torch.finfo(proj.dtype).max
+        outward = (
+            found.to(proj.dtype).clamp(-limit, limit)
+            for found in (torch.stack(points, dim=-1), torch.where(ok, depth, 0.0), residual)
+        )
+        return (*outward, status)
 
-    place = _at(found.points, listed.point)  # (3, T)
-    x, y, depth = (listed.camera[:, :3] * place).sum(dim=1) + listed.camera[:, 3]
-    behind = _sum((listed.used & ~(depth.detach() > 0)).to(depth.dtype), listed.point, num_points)
-    size = torch.maximum(
-        found.points.detach().abs().amax(dim=0),
-        _largest(depth.detach().abs(), listed.point, num_points),
-    )
-    status = judge_points(
-        found,
-        in_front=behind == 0,
-        size=size,
-        largest=torch.finfo(proj.dtype).max,
-        enough=listed.enough,
-        finite=listed.finite,
-    )
-    valid = status == Status.OK
-    ok = _at(valid, listed.point)
-    counts = listed.used & ok
-    dx = safe_divide(x, depth, counts) - torch.where(counts, listed.x, 0.0)
-    dy = safe_divide(y, depth, counts) - torch.where(counts, listed.y, 0.0)
-    errors = _sum(listed.squared * (dx * dx + dy * dy), listed.point, num_points)
-    mean = safe_divide(errors, listed.total, valid & (listed.total > 0))
-    positive = valid & (mean > 0)
-    # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-    residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
-    return TriangulatedTracks(
-        points=torch.where(valid, found.points, 0.0).mT.to(proj.dtype),
-        depth=torch.where(ok, depth, 0.0).to(proj.dtype),
-        status=status,
-        valid=valid,
-        residual=residual.to(proj.dtype),
-    )
+    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
+        posed = _pose(*inputs, num_points=num_points)
+        found, status = _find(posed)
+        points = kept(found.points, posed.around, status == Status.OK.value)
+        return known(posed, points, status)
+
+    def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
+        posed = _pose(*inputs, num_points=num_points)
+        found, status = _find(posed)
+        valid = status == Status.OK.value
+        near = derivable_points(posed.normal, posed.frame, found.vector, valid)
+        return known(posed, kept(near, posed.around, valid), status)
+
+    weight = torch.ones_like(pixels[:, 0]) if weights is None else weights
+    inputs = (proj, pixels, camera_index.long(), point_index.long(), weight)
+    points, depth, residual, status = recomputed(derivable, *inputs, values=values)
+    return TriangulatedTracks(points, depth, status, status == Status.OK.value, residual)
 
 
 def _sum(values: Tensor, index: Tensor, count: int) -> Tensor:
@@ -161,99 +174,150 @@ class _Listed(NamedTuple):
 
     Attributes:
         camera: ``(3, 4, T)`` projection matrix.
-        center: ``(3, T)`` of the camera.
-        x: ``(T)`` px, 0 where unused.
+        x: ``(T)`` px, 0 where not finite.
         y: ``(T)``.
-        squared: ``(T)`` squared weights, a point's largest 1; 0 where unused.
-        used: ``(T)`` of points that may be solvable.
-        counts: ``(T)`` the weight is not negligible beside the point's largest.
+        squared: ``(T)`` squared weights, a point's largest 1; 0 where unused or not finite.
+        unused: ``(T)`` bool.
         point: ``(T)`` index.
-        total: ``(N)`` sum of the squared weights.
-        finite: ``(N)`` everything used is.
-        enough: ``(N)`` at least two observations count.
+        sound: ``(N)`` bool: every used pixel and weight is finite.
     """
 
     camera: Tensor
-    center: Tensor
     x: Tensor
     y: Tensor
     squared: Tensor
-    used: Tensor
-    counts: Tensor
+    unused: Tensor
     point: Tensor
-    total: Tensor
-    finite: Tensor
-    enough: Tensor
+    sound: Tensor
+
+
+class _Posed(NamedTuple):
+    """The points' equations, in their frames.
+
+    Attributes:
+        listed: the observations.
+        rows: x p3 - p1 and y p3 - p2 in the frame, each four ``(T)``.
+        around: ``(1, 3)`` the origin of the sums, in the world.
+        frame: of the points.
+        normal: ten ``(N)``, in the frame.
+        dtype: of the inputs.
+    """
+
+    listed: _Listed
+    rows: tuple[Tensor, Tensor]
+    around: Tensor
+    frame: RigFrame
+    normal: Symmetric4
+    dtype: torch.dtype
+
+
+def _pose(
+    proj: Tensor,
+    pixels: Tensor,
+    camera_index: Tensor,
+    point_index: Tensor,
+    weights: Tensor,
+    *,
+    num_points: int,
+) -> _Posed:
+    work = solver_dtype(proj)
+    finite = (proj.detach().to(work).abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)
+    camera = torch.where(finite[:, None, None], proj, 0.0).to(work)
+    listed = _listed(camera, pixels, camera_index, point_index, num_points, weights)
+
+    centers = projection_centers(camera)
+    # Of all cameras alike: those that see nothing do no harm beyond rounding.
+    around = centers.detach().mean(dim=0, keepdim=True)
+    weighted, counted = camera_moments(centers, around, (~finite).to(work))
+    frame = rig_frame(
+        _sum(_at(weighted, camera_index) * listed.squared, point_index, num_points).unbind(),
+        _sum(
+            torch.where(listed.unused, 0.0, _at(counted, camera_index)), point_index, num_points
+        ).unbind(),
+        eps=torch.finfo(proj.dtype).eps,
+    )
+    frame = frame._replace(finite=frame.finite & listed.sound)
+    origin = _at(torch.stack(frame.origin), point_index) + around.mT
+    unit = _at(frame.unit, point_index)
+    moved = ((listed.camera[:, :3] * origin).sum(dim=1) + listed.camera[:, 3]) / unit
+    p1, p2, p3 = torch.cat([listed.camera[:, :3], moved[:, None]], dim=1)  # each (4, T)
+    rows = listed.x * p3 - p1, listed.y * p3 - p2
+    normal = _normal_matrix(rows, listed.squared, point_index, num_points)
+    return _Posed(listed, rows, around, frame, normal, proj.dtype)
 
 
 def _listed(
-    proj: Tensor,
+    camera: Tensor,
     pixels: Tensor,
     camera_index: Tensor,
     point_index: Tensor,
     num_points: int,
     weights: Tensor,
 ) -> _Listed:
-    work = solver_dtype(proj)
-    camera_index, point_index = camera_index.long(), point_index.long()
-    x, y = pixels.to(work).unbind(dim=-1)
-    weight = weights.to(work)
-    known_camera = proj.isfinite().all(-1).all(-1)
-    known = x.isfinite() & y.isfinite() & weight.isfinite() & _at(known_camera, camera_index)
-    used = weight != 0  # NaN counts as used, and is caught as not finite
-    wrong = _sum((used & ~known).to(work), point_index, num_points)
-    size = torch.where(used & known, weight.detach().abs(), 0.0)
-    largest = _at(_largest(size, point_index, num_points), point_index)
-    counts = used & (size > _NEGLIGIBLE_WEIGHT * largest)
-    enough = _sum(counts.to(work), point_index, num_points) >= 2
-    finite = wrong == 0
-    used = used & _at(finite & enough, point_index)
-    share = weight / torch.where(largest > 0, largest, 1.0)
-
-    # Double where throughout: what is not used must pass no gradient and no NaN.
-    squared = torch.where(used, share, 0.0).square()
-    camera = torch.where(known_camera[:, None, None], proj, 0.0).to(work)
-    centers, _ = projection_centers(camera)
+    x, y = pixels.to(camera.dtype).unbind(dim=-1)
+    weight = weights.to(camera.dtype)
+    with torch.no_grad():
+        size = weight.abs()
+        # What is beyond overflows; NaN is not below.
+        sound = (x * x + y * y < torch.finfo(x.dtype).max ** 0.25) & (
+            size <= torch.finfo(x.dtype).max
+        )
+        # NaN counts as used.
+        largest = _at(_largest(size.nan_to_num(0.0), point_index, num_points), point_index)
+        unused = size <= NEGLIGIBLE_WEIGHT * largest
+        wrong = _sum((~(sound | unused)).to(x.dtype), point_index, num_points)
+        largest = torch.where((largest > 0) & largest.isfinite(), largest, 1.0)
+    # Double where: what is not used must pass no gradient and no NaN.
+    share = torch.where(sound, weight, 0.0) / largest
     return _Listed(
         camera=_at(camera.permute(1, 2, 0), camera_index),
-        center=_at(centers.mT, camera_index),
-        x=torch.where(used, x, 0.0),
-        y=torch.where(used, y, 0.0),
-        squared=squared,
-        used=used,
-        counts=counts,
+        x=torch.where(sound, x, 0.0),
+        y=torch.where(sound, y, 0.0),
+        squared=torch.where(unused, 0.0, share * share),
+        unused=unused,
         point=point_index,
-        total=_sum(squared, point_index, num_points),
-        finite=finite,
-        enough=enough,
+        sound=wrong == 0,
     )
 
 
-def _frame(listed: _Listed) -> RigFrame:
-    point, count = listed.point, listed.total.shape[0]
-    total = _at(listed.total, point)
-    share = safe_divide(listed.squared, total, total > 0)
-    # Its rounding, far from the world's origin, does no harm: any origin near by will do.
-    origin = _sum(share * listed.center, point, count)
-    apart = (listed.center - _at(origin, point)).square().sum(dim=0)
-    variance = _sum(share * apart, point, count)
-    unit = torch.where(variance > torch.finfo(variance.dtype).tiny, variance, 1.0).sqrt()
-    reach = _largest(torch.where(listed.counts, apart.detach(), 0.0), point, count).sqrt()
-    from_world = listed.center.detach().square().sum(dim=0)
-    farthest = _largest(torch.where(listed.counts, from_world, 0.0), point, count).sqrt()
-    return RigFrame(origin, unit, reach, farthest, listed.finite & listed.enough)
-
-
-def _normal_matrix(listed: _Listed, frame: RigFrame) -> Symmetric4:
-    """A^T W^2 A of the DLT rows x p3 - p1, y p3 - p2 in each point's frame, as ten ``(N)``."""
-    origin, unit = _at(frame.origin, listed.point), _at(frame.unit, listed.point)
-    moved = ((listed.camera[:, :3] * origin).sum(dim=1) + listed.camera[:, 3]) / unit
-    p1, p2, p3 = torch.cat([listed.camera[:, :3], moved[:, None]], dim=1)  # each (4, T)
-    a, b = listed.x * p3 - p1, listed.y * p3 - p2
-    wa, wb = listed.squared * a, listed.squared * b
+def _normal_matrix(
+    rows: tuple[Tensor, Tensor], squared: Tensor, point: Tensor, count: int
+) -> Symmetric4:
+    """A^T W^2 A as ten ``(N)``."""
+    a, b = rows
+    wa, wb = squared * a, squared * b
     entries = torch.stack(
         [torch.addcmul(wa[i] * a[j], wb[i], b[j]) for i in range(4) for j in range(i, 4)]
     )
-    sums = _sum(entries, listed.point, listed.total.shape[0])
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = sums.unbind(dim=0)
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = _sum(entries, point, count).unbind(dim=0)
     return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+
+
+@torch.no_grad()
+def _find(posed: _Posed) -> tuple[FoundPoints, Tensor]:
+    """Points and their status, without gradient."""
+    listed, count = posed.listed, posed.frame.unit.shape[0]
+
+    def product(x: Vector4) -> Vector4:
+        a, b = posed.rows
+        place = _at(torch.stack(x), listed.point)
+        along_a, along_b = (a * place).sum(dim=0), (b * place).sum(dim=0)
+        rows = listed.squared * (a * along_a + b * along_b)
+        g0, g1, g2, g3 = _sum(rows, listed.point, count)
+        return g0, g1, g2, g3
+
+    polish = 2 if posed.dtype == torch.float64 else 0
+    eps = torch.finfo(posed.dtype).eps
+    found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
+    x, y, z = kept(found.points, posed.around, found.near)
+    _, _, depth = _project(listed.camera, _at(torch.stack([x, y, z]), listed.point))
+    behind = _sum((~listed.unused & ~(depth > 0)).to(depth.dtype), listed.point, count)
+    held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
+    status = judge_points(found, posed.frame, in_front=behind == 0, representable=held)
+    return found, status
+
+
+def _project(camera: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Homogeneous pixels of points ``(3, T)`` in cameras ``(3, 4, T)``, each ``(T)``."""
+    x, y, depth = (camera[:, :3] * points).sum(dim=1) + camera[:, 3]
+    return x, y, depth

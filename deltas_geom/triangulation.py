@@ -1,34 +1,46 @@
 """Weighted, masked n-view DLT triangulation; every point carries a Status.
 
-Each point is solved in its own rig frame: origin at the w^2-weighted mean of the centres of
-the cameras that see it, unit their spread. There the algebraic error is nearly the angular
-one, the answer does not depend on the world's origin or unit, and a masked view leaves no
-trace. Sums and solve run in float64 whatever the input, where the device has it.
+Each point is solved in its own rig frame (rig_frame.py), in float64 whatever the input, where the
+device has it. Backward keeps only the inputs and computes the rest again.
 """
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.null_vector import Symmetric4, multiply, null_vector
+from deltas_geom.chunks import in_chunks
+from deltas_geom.normal_matrix import normal_matrix
+from deltas_geom.null_vector import Symmetric4, Vector4
+from deltas_geom.observations import (
+    Observations,
+    Vector3,
+    observe,
+    over_views,
+    projection_centers,
+)
+from deltas_geom.rig_frame import (
+    FoundPoints,
+    RigFrame,
+    derivable_points,
+    find_points,
+    in_frame,
+    judge_points,
+    kept,
+    rig_frames,
+)
 from deltas_geom.status import Status
 from deltas_geom.uncertainty import (
-    point_covariance,
-    projection_centers,
-    ray_parallax,
-    reprojection_residual,
-    solver_dtype,
+    covariance_of,
+    in_views,
+    parallax_of,
+    reproject,
+    residual_of,
+    unpacked3,
 )
 
-# A view whose weight is below this share of the point's largest counts as no view: its squared
-# weight, times a small parallax, would be lost in the rounding of the normal matrix.
-_NEGLIGIBLE_WEIGHT = 1e-6
-_CHUNK, _SMALLEST_CHUNK = 8192, 1024  # points
-_UPPER = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
+# Steps in float64. In the world's frame extreme weights leave the normal matrix few digits.
+_POLISH = {"rig": 2, "world": 12}
 
 
 class Triangulation(NamedTuple):
@@ -63,12 +75,16 @@ def triangulate_points(
     frame: Literal["rig", "world"] = "rig",
 ) -> Tensor:
     """Points ``(*B, N, 3)`` alone; see :func:`triangulate`."""
+    _check_frame(frame)
 
-    def solve(chunk: _Chunk) -> tuple[Tensor]:
-        observed = _observe(proj, *chunk)
-        return (_judge(observed, _solve(observed, frame))[0],)
+    def values(*inputs: Tensor) -> tuple[Tensor]:
+        return (_outward(_values(*inputs, frame=frame), proj.dtype),)
 
-    return _in_chunks(solve, pixels, weights, mask, dims=(-2,))[0]
+    def derivable(*inputs: Tensor) -> tuple[Tensor]:
+        return (_outward(_derivable(*inputs, frame=frame), proj.dtype),)
+
+    points = ((pixels, -2), (weights, -1), (mask, -1))
+    return in_chunks(derivable, values, proj, points, dims=(-2,))[0]
 
 
 def triangulate(
@@ -111,289 +127,166 @@ def triangulate(
         tensor([[0.2000, 0.0000, 2.0000]])
     """
 
-    def solve(chunk: _Chunk) -> tuple[Tensor, ...]:
-        observed = _observe(proj, *chunk)
-        points, status = _judge(observed, _solve(observed, frame))
-        valid = status == Status.OK
-        homogeneous = to_homogeneous(points).unsqueeze(-3) @ observed.proj.mT
-        depth = torch.where(valid.unsqueeze(-2), homogeneous[..., 2], 0.0)
-        used_weights = torch.where(valid.unsqueeze(-2), observed.weights, 0.0)
-        residual = reprojection_residual(observed.proj, points, observed.pixels, used_weights)
-        parallax = ray_parallax(observed.proj, points, used_weights > 0)
-        found = (points, depth, status, valid, residual, parallax)
-        if not covariance:
-            return found
-        return (*found, point_covariance(observed.proj, points, used_weights))
+    _check_frame(frame)
 
-    dims = (-2, -1, -1, -1, -1, -1, *([-3] if covariance else []))
-    found = _in_chunks(solve, pixels, weights, mask, dims=dims)
-    points, depth, status, valid, residual, parallax = found[:6]
-    uncertainty = found[6] if covariance else None
-    return Triangulation(points, depth, status, valid, residual, parallax, uncertainty)
+    def known(solved: _Solved) -> tuple[Tensor, ...]:
+        observed, valid = solved.observed, solved.status == Status.OK.value
+        used = ~observed.weights.unused & valid.unsqueeze(-2)
+        seen = reproject(observed.proj, solved.points, used)
+        limit = torch.finfo(proj.dtype).max
+        found: tuple[Tensor, ...] = (
+            torch.stack(solved.points, dim=-1),
+            torch.where(valid.unsqueeze(-2), seen.depth, 0.0),
+            residual_of(seen, observed.xy, observed.weights.squared),
+            parallax_of(solved.centers, solved.points, used.to(seen.x.dtype)),
+        )
+        if covariance:
+            noise = unpacked3(covariance_of(observed.proj, seen, observed.weights.squared))
+            unit = observed.weights.largest.square().squeeze(-2)
+            found = (*found, noise / unit[..., None, None])
+        outward = (tensor.to(proj.dtype).clamp(-limit, limit) for tensor in found)
+        return (*outward, solved.status)
+
+    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
+        return known(_values(*inputs, frame=frame))
+
+    def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
+        return known(_derivable(*inputs, frame=frame))
+
+    dims = (-2, -1, -1, -1, *([-3] if covariance else []), -1)
+    points = ((pixels, -2), (weights, -1), (mask, -1))
+    found = in_chunks(derivable, values, proj, points, dims=dims)
+    places, depth, residual, parallax, *noise, status = found
+    valid = status == Status.OK.value
+    return Triangulation(
+        places, depth, status, valid, residual, parallax, noise[0] if noise else None
+    )
 
 
-_Chunk = tuple[Tensor, Tensor | None, Tensor | None]
-"""Pixels, weights and mask of some of the points."""
+class _Posed(NamedTuple):
+    """The points' equations, in frames where they are easy.
+
+    Attributes:
+        observed: what was seen.
+        around: ``(*B, 1, 3)`` the origin of the sums, in the world.
+        proj: ``(*B, V, 3, 4)`` of points relative to it.
+        centers: ``(*B, V, 3)`` of the cameras, in the world.
+        frame: of the points.
+        normal: ten ``(*B, N)``, in the frame.
+        dtype: of the inputs.
+    """
+
+    observed: Observations
+    around: Tensor
+    proj: Tensor
+    centers: Tensor
+    frame: RigFrame
+    normal: Symmetric4
+    dtype: torch.dtype
 
 
-def _in_chunks(
-    solve: Callable[[_Chunk], tuple[Tensor, ...]],
+class _Solved(NamedTuple):
+    """Points before they leave the solver's type and layout.
+
+    Attributes:
+        observed: what was seen.
+        centers: ``(*B, V, 3)`` of the cameras.
+        points: three ``(*B, N)`` in the world; 0 where they fail.
+        status: ``(*B, N)``.
+    """
+
+    observed: Observations
+    centers: Tensor
+    points: Vector3
+    status: Tensor
+
+
+def _pose(
+    proj: Tensor,
     pixels: Tensor,
     weights: Tensor | None,
     mask: Tensor | None,
     *,
-    dims: tuple[int, ...],
-) -> tuple[Tensor, ...]:
-    """Solve some points at a time, so that what lies between stays in the cache.
-
-    Args:
-        solve: from a chunk to results.
-        pixels: ``(*B, V, N, 2)``.
-        weights: ``(*B, V, N)`` or None.
-        mask: ``(*B, V, N)`` or None.
-        dims: along which each result is put together.
-    """
-    count = pixels.shape[-2]
-    chunk = max(_SMALLEST_CHUNK, _CHUNK // max(1, pixels.shape[:-3].numel()))
-    if count <= chunk:
-        return solve((pixels, weights, mask))
-    parts = []
-    for first in range(0, count, chunk):
-        some = slice(first, first + chunk)
-        parts.append(
-            solve(
-                (
-                    pixels[..., some, :],
-                    None if weights is None else weights[..., some],
-                    None if mask is None else mask[..., some],
-                )
-            )
-        )
-    columns = zip(*parts, strict=True)
-    return tuple(torch.cat(column, dim=dim) for dim, column in zip(dims, columns, strict=True))
+    frame: str,
+) -> _Posed:
+    observed = observe(proj, pixels, weights, mask)
+    centers = projection_centers(observed.proj)
+    eps = torch.finfo(proj.dtype).eps
+    around, rig = rig_frames(centers, observed.weights, observed.sick, eps=eps)
+    moved = observed.proj[..., 3:] + observed.proj[..., :3] @ around.unsqueeze(-3).mT
+    near = torch.cat([observed.proj[..., :3].expand(*moved.shape[:-1], 3), moved], dim=-1)
+    if frame == "world":
+        ox, oy, oz = (-middle.expand_as(rig.unit) for middle in around.unbind(dim=-1))
+        rig = rig._replace(origin=(ox, oy, oz), unit=torch.ones_like(rig.unit))
+    x, y = observed.xy.unbind(dim=-2)
+    entries = normal_matrix(near, x, y, observed.weights.squared)
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries
+    normal = in_frame((m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), rig.origin, rig.unit)
+    return _Posed(observed, around, near, centers, rig, normal, proj.dtype)
 
 
-class _Observations(NamedTuple):
-    """The inputs, broadcast, with everything unusable replaced and flagged.
+@torch.no_grad()
+def _find(posed: _Posed, frame: str) -> tuple[FoundPoints, Tensor]:
+    """Points and their status, without gradient."""
 
-    Attributes:
-        proj: ``(*B, V, 3, 4)`` finite.
-        pixels: ``(*B, V, N, 2)`` finite.
-        weights: ``(*B, V, N)`` finite; 0 for unused views and unsolvable points.
-        largest: ``(*B, 1, N)`` largest weight of each point.
-        counts: ``(*B, V, N)`` the view's weight is not negligible beside the largest.
-        finite: ``(*B, N)`` everything used is finite.
-        enough: ``(*B, N)`` at least two views count.
-    """
+    def product(x: Vector4) -> Vector4:
+        return _product(posed, x)
 
-    proj: Tensor
-    pixels: Tensor
-    weights: Tensor
-    largest: Tensor
-    counts: Tensor
-    finite: Tensor
-    enough: Tensor
-
-
-def _observe(
-    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> _Observations:
-    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
-    weight = torch.ones_like(pixels[..., 0])
-    if weights is not None:
-        check_shapes(weights=(weights, "V N"), pixels=(pixels, "V N 2"))
-        weight = weight * weights
-    if mask is not None:
-        check_shapes(mask=(mask, "V N"), pixels=(pixels, "V N 2"))
-        weight = torch.where(mask, weight, 0.0)
-    batch = batch_shape(proj.shape[:-3], weight.shape[:-2])
-    weight = weight.expand(*batch, *weight.shape[-2:])
-    pixels = pixels.expand(*weight.shape, 2)
-
-    used = weight != 0  # NaN counts as used, and is caught as not finite
-    finite_proj = proj.isfinite().all(-1).all(-1)[..., None]
-    finite = ((pixels.isfinite().all(dim=-1) & weight.isfinite() & finite_proj) | ~used).all(-2)
-    largest = torch.where(used, weight.detach().abs(), 0.0).amax(dim=-2, keepdim=True)
-    counts = used & (weight.detach().abs() > _NEGLIGIBLE_WEIGHT * largest)
-    enough = counts.sum(dim=-2) >= 2
-    solvable = (finite & enough).unsqueeze(-2) & used
-    # Double where throughout: what is not used must pass no gradient and no NaN.
-    return _Observations(
-        proj=torch.where(finite_proj[..., None], proj, 0.0),
-        pixels=torch.where(solvable[..., None], pixels, 0.0),
-        weights=torch.where(solvable, weight, 0.0),
-        largest=torch.where(largest > 0, largest, 1.0),
-        counts=counts,
-        finite=finite,
-        enough=enough,
-    )
+    # What the normal matrix loses of the rows' digits matters to those who have them.
+    polish = 0
+    if posed.dtype == torch.float64:
+        polish = _POLISH[frame]
+    eps = torch.finfo(posed.dtype).eps
+    found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
+    x, y, z = kept(found.points, posed.around, found.near)
+    # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
+    depth = in_views(posed.observed.proj[..., 2, :], (x, y, z))
+    in_front = torch.where(posed.observed.weights.unused, 1.0, depth).amin(dim=-2) > 0
+    held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
+    status = judge_points(found, posed.frame, in_front=in_front, representable=held)
+    return found, status
 
 
-class _Solution(NamedTuple):
-    """Points ``(*B, N, 3)`` before they are judged, and what is known of each ``(*B, N)``."""
+def _values(*inputs: Tensor, frame: str) -> _Solved:
+    posed = _pose(*inputs, frame=frame)
+    found, status = _find(posed, frame)
+    points = kept(found.points, posed.around, status == Status.OK.value)
+    return _Solved(posed.observed, posed.centers, points, status)
 
-    points: Tensor
-    posed: Tensor
-    at_infinity: Tensor
+
+def _derivable(*inputs: Tensor, frame: str) -> _Solved:
+    posed = _pose(*inputs, frame=frame)
+    found, status = _find(posed, frame)
+    valid = status == Status.OK.value
+    near = derivable_points(posed.normal, posed.frame, found.vector, valid)
+    return _Solved(posed.observed, posed.centers, kept(near, posed.around, valid), status)
 
 
-def _solve(observed: _Observations, frame: str) -> _Solution:
-    """Minimise the weighted algebraic error in float64, in the frame asked for.
+def _product(posed: _Posed, v: Vector4) -> Vector4:
+    """A^T W^2 (A v) of the equations in the frame: the normal matrix times v, unsquared."""
+    (ox, oy, oz), inverse = posed.frame.origin, 1 / posed.frame.unit
+    w = v[3] * inverse
+    place = (torch.addcmul(v[0], ox, w), torch.addcmul(v[1], oy, w), torch.addcmul(v[2], oz, w))
+    p, squared = posed.proj, posed.observed.weights.squared
+    x, y = posed.observed.xy.unbind(dim=-2)
+    a, b, c = (_homogeneous_in_views(p[..., row, :], (*place, w)) for row in range(3))
+    across, down = (x * c - a) * squared, (y * c - b) * squared
+    sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
+    g0, g1, g2, g3 = over_views(p.flatten(-3, -2).mT, sums)
+    return g0, g1, g2, (ox * g0 + oy * g1 + oz * g2 + g3) * inverse
 
-    Per-point vectors are ``(*B, 3, N)`` here: sums over a leading dim of three run over memory
-    in order, sums over a trailing one do not.
-    """
+
+def _homogeneous_in_views(row: Tensor, points: Vector4) -> Tensor:
+    total = row[..., 3, None] * points[3].unsqueeze(-2)
+    for axis in range(3):
+        total = torch.addcmul(total, row[..., axis, None], points[axis].unsqueeze(-2))
+    return total
+
+
+def _outward(solved: _Solved, dtype: torch.dtype) -> Tensor:
+    return torch.stack(solved.points, dim=-1).to(dtype)
+
+
+def _check_frame(frame: str) -> None:
     if frame not in ("rig", "world"):
         raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
-    work = solver_dtype(observed.proj)
-    proj = observed.proj.to(work)
-    # The scale of all weights cancels; without it their squares cannot underflow.
-    squared = (observed.weights.to(work) / observed.largest).square()
-
-    centers, _ = projection_centers(proj)
-    origin, unit = _shared_frame(centers.detach(), (observed.weights != 0).any(dim=-1))
-    moved = proj[..., 3:] + proj[..., :3] @ origin.unsqueeze(-2).mT
-    directions = proj[..., :3].expand(*moved.shape[:-1], 3)
-    shared = torch.cat([directions, moved / unit[..., None, None]], dim=-1)
-    normal = _normal_matrix(shared, observed.pixels.to(work), squared)
-    point = _point_frame((centers - origin) / unit[..., None], squared, observed.counts)
-    if frame == "rig":
-        normal = _change_frame(normal, point.origin, point.unit)
-    else:
-        normal = _change_frame(normal, (-origin / unit).mT, 1 / unit)
-
-    # Centres closer together than the rounding of where they are do not differ.
-    eps = torch.finfo(observed.proj.dtype).eps
-    baseline = point.reach * unit
-    from_world = centers.detach().norm(dim=-1)[..., None]
-    from_world = torch.where(observed.counts, from_world, 0.0).amax(dim=-2)
-    posed = observed.finite & observed.enough & (baseline > 64 * eps * from_world)
-    matrix, scalable = _made_safe(normal, posed)
-    (x0, x1, x2, x3), simple = null_vector(matrix)
-    posed = posed & scalable & simple
-
-    # Far above the smallest number, so that the gradient of the division is finite.
-    divisible = x3 > torch.finfo(work).tiny ** (1 / 3)
-    inverse = safe_divide(torch.ones_like(x3), x3, posed & divisible)
-    points = torch.stack([x0, x1, x2], dim=-2) * inverse.unsqueeze(-2)
-    if frame == "rig":
-        distance = _length(points.detach()) * point.unit.detach() * unit
-        points = (points * point.unit.unsqueeze(-2) + point.origin) * unit[..., None] + origin.mT
-    else:
-        rig_center = point.origin.detach() * unit[..., None] + origin.mT
-        distance = _length(points.detach() - rig_center)
-    at_infinity = ~divisible | (16 * eps * distance > baseline)
-    points = torch.where((posed & ~at_infinity).unsqueeze(-2), points, 0.0)
-    return _Solution(points.mT, posed, at_infinity)
-
-
-def _length(vectors: Tensor) -> Tensor:
-    """``(*B, N)`` lengths of ``(*B, 3, N)``."""
-    return vectors.square().sum(dim=-2).sqrt()
-
-
-def _judge(observed: _Observations, solution: _Solution) -> tuple[Tensor, Tensor]:
-    """Points ``(*B, N, 3)`` of the inputs' dtype, 0 where they fail, and status ``(*B, N)``."""
-    found = solution.points.detach()
-    # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-    wide_proj = observed.proj.detach().to(found.dtype)
-    depth = (to_homogeneous(found).unsqueeze(-3) @ wide_proj.mT)[..., 2]
-    in_front = ((depth > 0) | (observed.weights == 0)).all(dim=-2)
-    size = torch.maximum(found.abs().amax(dim=-1), depth.abs().amax(dim=-2))
-    too_far = solution.at_infinity | (size >= torch.finfo(observed.proj.dtype).max)
-    ok = solution.posed & ~too_far & in_front
-    status = torch.full_like(observed.enough, Status.OK, dtype=torch.int8)
-    for failed, reason in (
-        (~in_front, Status.BEHIND_CAMERA),
-        (too_far, Status.AT_INFINITY),
-        (~solution.posed, Status.NO_PARALLAX),
-        (~observed.enough, Status.TOO_FEW_VIEWS),
-        (~observed.finite, Status.NOT_FINITE_INPUT),
-    ):
-        status = torch.where(failed, torch.full_like(status, reason), status)
-    return torch.where(ok[..., None], solution.points, 0.0).to(observed.proj.dtype), status
-
-
-def _shared_frame(centers: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean ``(*B, 1, 3)`` and spread ``(*B, 1)`` of the centres of views used by any point."""
-    count = used.sum(dim=-1, keepdim=True).clamp(min=1)
-    origin = torch.where(used[..., None], centers, 0.0).sum(dim=-2) / count
-    squared = (centers - origin.unsqueeze(-2)).square().sum(dim=-1)
-    spread = (torch.where(used, squared, 0.0).sum(dim=-1, keepdim=True) / count).sqrt()
-    return origin.unsqueeze(-2), torch.where(spread > 0, spread, 1.0)
-
-
-def _normal_matrix(proj: Tensor, xy: Tensor, squared: Tensor) -> Symmetric4:
-    """A^T W^2 A of the DLT rows x p3 - p1, y p3 - p2, as ten ``(*B, N)``.
-
-    Every entry is linear in (x^2 + y^2, x, y, 1), so all points cost one matrix product.
-    """
-    p1, p2, p3 = proj.unbind(dim=-2)
-    rows, columns = _UPPER
-
-    def outer(a: Tensor, b: Tensor) -> Tensor:
-        return (a[..., rows] * b[..., columns] + b[..., rows] * a[..., columns]) / 2
-
-    coefficients = torch.stack(
-        [outer(p3, p3), -2 * outer(p3, p1), -2 * outer(p3, p2), outer(p1, p1) + outer(p2, p2)],
-        dim=-2,
-    )  # (*B, V, 4, 10)
-    x, y = xy.unbind(dim=-1)
-    terms = torch.stack([(x * x + y * y) * squared, x * squared, y * squared, squared], dim=-2)
-    entries = coefficients.flatten(-3, -2).mT @ terms.flatten(-3, -2)
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries.unbind(dim=-2)
-    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
-
-
-class _PointFrame(NamedTuple):
-    """Each point's rig frame, in the shared one.
-
-    Attributes:
-        origin: ``(*B, 3, N)`` mean of the centres, weighted by the squared weights.
-        unit: ``(*B, N)`` their spread.
-        reach: ``(*B, N)`` largest distance of a centre that counts from the origin.
-    """
-
-    origin: Tensor
-    unit: Tensor
-    reach: Tensor
-
-
-def _point_frame(centers: Tensor, squared: Tensor, counts: Tensor) -> _PointFrame:
-    total = squared.sum(dim=-2)
-    share = safe_divide(squared, total.unsqueeze(-2), (total > 0).unsqueeze(-2))
-    origin = centers.mT @ share
-    apart = (centers[..., None] - origin.unsqueeze(-3)).square().sum(dim=-2)  # (*B, V, N)
-    variance = (share * apart).sum(dim=-2)
-    unit = torch.where(variance > torch.finfo(variance.dtype).tiny, variance, 1.0).sqrt()
-    reach = torch.where(counts, apart.detach(), 0.0).amax(dim=-2).sqrt()
-    return _PointFrame(origin, unit, reach)
-
-
-def _change_frame(normal: Symmetric4, origin: Tensor, unit: Tensor) -> Symmetric4:
-    """T^T M T for points x = unit x' + origin."""
-    m00, m01, m02, _, m11, m12, _, m22, _, _ = normal
-    o0, o1, o2 = (component.expand_as(m00) for component in origin.unbind(dim=-2))
-    one = torch.ones_like(o0)
-    n03, n13, n23, n33 = multiply(normal, (o0, o1, o2, one))
-    last = o0 * n03 + o1 * n13 + o2 * n23 + n33
-    u, u2 = unit, unit * unit
-    return (
-        m00 * u2, m01 * u2, m02 * u2, n03 * u,
-        m11 * u2, m12 * u2, n13 * u,
-        m22 * u2, n23 * u,
-        last,
-    )  # fmt: skip
-
-
-def _made_safe(normal: Symmetric4, posed: Tensor) -> tuple[Symmetric4, Tensor]:
-    """Scaled to trace 1, and whether it can be; if not, a constant with an easy null vector."""
-    trace = (normal[0] + normal[4] + normal[7] + normal[9]).detach()
-    usable = posed & (trace > 0) & trace.isfinite()
-    scale = torch.where(usable, trace, 1.0)
-    easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.1)
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
-        torch.where(usable, entry / scale, constant)
-        for entry, constant in zip(normal, easy, strict=True)
-    )
-    return (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), usable

@@ -2,16 +2,10 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from deltas_geom.testing.conformance import conformance, table
-from deltas_geom.testing.targets import KORNIA_SOLVERS, Target, deltas, kornia, opencv
-
-TARGETS: dict[str, Callable[[], list[Target]]] = {
-    "deltas": lambda: [deltas()],
-    "kornia": lambda: [kornia(solver) for solver in KORNIA_SOLVERS],
-    "opencv": lambda: [opencv()],
-}
+from deltas_geom.testing.targets import TARGETS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -33,6 +33,14 @@ class PosedScene(NamedTuple):
     points: Tensor
     pixels: Tensor
 
+    def sketch(self) -> str:
+        """One line, of a scene without batch dims: the first point and where it is seen."""
+        seen = ", ".join(_numbers(view[0]) for view in self.pixels)
+        more = self.points.shape[0] - 1
+        others = f" and {more} more" if more else ""
+        point = _numbers(self.points[0])
+        return f"{self.views.num_views} views, point {point} m{others}, seen at {seen} px"
+
 
 def default_intrinsics(*, dtype: torch.dtype = torch.float64) -> Tensor:
     """A camera ``(3, 3)`` of 640 x 480 pixels and about 65 degrees, in whole numbers.
@@ -169,3 +177,7 @@ def _views(
 def _cloud(dtype: torch.dtype) -> Tensor:
     points = [[0.5, 0.25, 4.0], [-1.0, 0.5, 3.0], [0.75, -0.5, 5.0]]
     return torch.tensor(points, dtype=dtype)
+
+
+def _numbers(vector: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.7g}" for value in vector.tolist()) + ")"

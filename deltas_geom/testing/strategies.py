@@ -14,7 +14,10 @@ except ImportError as error:  # pragma: no cover
         "deltas_geom.testing.strategies needs hypothesis: pip install 'deltas-depth[test]'"
     ) from error
 
+from deltas_geom.projection import unproject
+from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene, rigid, scene_from
+from deltas_geom.testing.target import DepthRange
 from deltas_geom.views import PosedViews
 
 
@@ -88,6 +91,27 @@ def posed_scenes(draw: st.DrawFn, num_views: int = 2, num_points: int = 4) -> Po
 
 
 @st.composite
+def rigs(draw: st.DrawFn, num_points: int = 3) -> PosedScene:
+    """Two views within a metre, turned by up to a radian, and keypoints anywhere in the first.
+
+    The points are those 4 m ahead of the keypoints; the second view need not see them.
+    """
+    views = PosedViews(draw(intrinsics(2)), draw(poses(2, turn=0.6, shift=0.5)))
+    keypoints = draw(image_pixels(num_points))
+    depth = torch.full((1, num_points), 4.0, dtype=torch.float64)
+    scene = scene_from(views, unproject(views.select([0]), keypoints[None], depth)[0])
+    return scene._replace(pixels=torch.stack([keypoints, scene.pixels[1]]))
+
+
+@st.composite
+def depth_ranges(draw: st.DrawFn) -> DepthRange:
+    """(near, far) in metres: near 0.2 to 2, far 1.5 to 20 times that, or infinite."""
+    near = draw(st.floats(0.2, 2.0))
+    far = draw(st.one_of(st.just(float("inf")), st.floats(1.5, 20).map(lambda share: near * share)))
+    return near, far
+
+
+@st.composite
 def image_pixels(
     draw: st.DrawFn, count: int, *, image_size: tuple[int, int] = IMAGE_SIZE
 ) -> Tensor:
@@ -107,3 +131,43 @@ def extreme(draw: st.DrawFn, *shape: int, decades: float = 30.0) -> Tensor:
     number = st.one_of(st.just(0.0), magnitude, magnitude.map(lambda value: -value))
     drawn = draw(st.lists(number, min_size=count, max_size=count))
     return torch.tensor(drawn, dtype=torch.float64).reshape(shape)
+
+
+@st.composite
+def map_scenes(
+    draw: st.DrawFn, cells: tuple[int, int] = (3, 4), channels: int = 2, num_pixels: int = 5
+) -> MapScene:
+    """A map of an image in cells of 1 to 8 px on a side, and pixels anywhere in the image."""
+    height, width = cells
+    strides = st.sampled_from([1, 2, 4, 8])
+    image_size = (height * draw(strides), width * draw(strides))
+    return MapScene(
+        draw(vectors(channels, within=1.0, size=height * width)).reshape(channels, *cells),
+        draw(image_pixels(num_pixels, image_size=image_size)),
+        draw(vectors(num_pixels, within=1.0, size=channels)),
+        image_size,
+    )
+
+
+@st.composite
+def score_scenes(draw: st.DrawFn, size: tuple[int, int] = (2, 4), dims: int = 2) -> ScoreScene:
+    """Logits between -5 and 5 of places within 10, some of them masked, never all."""
+    count = size[0] * size[1]
+    mask = torch.tensor(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+    mask[draw(st.integers(0, count - 1))] = True
+    logits = draw(vectors(1, within=5.0, size=count)).reshape(size)
+    return ScoreScene(logits, draw(vectors(count, within=10.0, size=dims)), mask.reshape(size))
+
+
+@st.composite
+def depth_scenes(
+    draw: st.DrawFn, num_points: int = 8, image_size: tuple[int, int] = (4, 5)
+) -> DepthScene:
+    """Pixels in and around a tiny image, so that they collide; depths of 1, 2, ... m; weights."""
+    order = draw(st.permutations(range(num_points)))
+    return DepthScene(
+        1.2 * draw(image_pixels(num_points, image_size=image_size)),
+        torch.arange(1.0, num_points + 1, dtype=torch.float64)[order],
+        0.6 + draw(vectors(1, within=0.4, size=num_points))[0],
+        image_size,
+    )

@@ -18,8 +18,17 @@ from deltas_geom import (
     to_homogeneous,
 )
 from deltas_geom.testing import PosedScene, forward_motion, rigid, zero_baseline
+from deltas_geom.testing.invariants import INVARIANTS, World
 from deltas_geom.testing.scenes import IMAGE_SIZE
 from deltas_geom.testing.strategies import extreme, image_pixels, posed_scenes, scales, vectors
+from deltas_geom.testing.targets import deltas
+
+OURS = deltas()
+EXACT = [
+    "a_match_lies_on_its_epipolar_line",
+    "the_fundamental_matrix_back_is_the_transpose",
+    "the_fundamental_matrix_follows_a_crop_and_a_resize",
+]
 
 
 def test_wrong_shapes_are_named() -> None:
@@ -38,11 +47,9 @@ def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
 
 
 @given(scene=posed_scenes())
-def test_a_match_lies_on_its_epipolar_line(scene: PosedScene) -> None:
-    fundamental = fundamental_between(scene.views, anchor=0, source=1)
-    lines = epipolar_lines(fundamental, scene.pixels[0])
-    offset = (lines * to_homogeneous(scene.pixels[1])).sum(dim=-1)  # px
-    assert_close(offset, torch.zeros_like(offset), rtol=0, atol=1e-8)
+@pytest.mark.parametrize("name", EXACT)
+def test_lines_are_exact(name: str, scene: PosedScene) -> None:
+    INVARIANTS[name](OURS, scene, tolerance=1e-8)  # px
 
 
 @given(scene=posed_scenes())
@@ -69,10 +76,12 @@ def test_swapping_the_views_transposes(scene: PosedScene) -> None:
 def test_lines_do_not_know_the_worlds_origin_axes_or_unit(
     scene: PosedScene, turn: Tensor, shift: Tensor, scale: float
 ) -> None:
-    cam_from_new = scene.views.cam_from_world @ rigid(turn, shift)[0]
-    cam_from_new[:, :3, 3] *= scale
-    moved = fundamental_between(PosedViews(scene.views.K, cam_from_new))
-    fundamental = fundamental_between(scene.views)
+    world = World(rigid(turn, shift)[0], scale)
+    INVARIANTS["the_fundamental_matrix_does_not_know_the_worlds_frame"](OURS, scene, world=world)
+    # Metric, the scale included: F is in metres of baseline.
+    moved, fundamental = (
+        fundamental_between(views) for views in (world.views(scene.views), scene.views)
+    )
     assert_close(moved, scale * fundamental, rtol=1e-8, atol=1e-11 * scale)
     distance = epipolar_distance(moved, scene.pixels[0], scene.pixels[1])
     assert_close(distance, torch.zeros_like(distance), rtol=0, atol=1e-7)  # px

@@ -1,4 +1,4 @@
-"""Correlation, soft-argmax, and matches of both kinds."""
+"""Soft-argmax, and matches of both kinds."""
 
 import pytest
 import torch
@@ -10,35 +10,22 @@ from torch.testing import assert_close
 from deltas_geom import (
     Samples,
     ShapeError,
-    correlate,
     epipolar_segments,
     match_joint,
     match_per_view,
     sample_inv_depths,
-    sample_map,
     sample_segments,
     soft_argmax,
     triangulate,
 )
 from deltas_geom.testing import PosedScene, forward_motion
 from deltas_geom.testing.scenes import IMAGE_SIZE
-from deltas_geom.testing.strategies import extreme, image_pixels, posed_scenes, vectors
+from deltas_geom.testing.strategies import extreme, posed_scenes, vectors
 
 INV_DEPTHS = torch.linspace(0.05, 0.8, 31, dtype=torch.float64)  # 1/m
 
 
-def all_read(pixels: Tensor) -> Samples:
-    """Samples ``(1, N, O=1, S=1)`` at pixels ``(N, 2)`` of one source."""
-    places = pixels[None, :, None, None, :]
-    return Samples(places, places[..., 0, :, 0], torch.ones(places.shape[:-1], dtype=torch.bool))
-
-
 def test_wrong_arguments_are_named() -> None:
-    samples = all_read(torch.zeros(5, 2))
-    with pytest.raises(ShapeError, match="descriptors"):
-        correlate(torch.zeros(3), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
-    with pytest.raises(ShapeError, match="feature_map has D = 3 but descriptors has D = 2"):
-        correlate(torch.zeros(5, 2), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
     with pytest.raises(ShapeError, match="positions has S = 3 but logits has S = 2"):
         soft_argmax(torch.zeros(2), torch.zeros(3, 1))
     segments = epipolar_segments(
@@ -54,9 +41,7 @@ def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
     samples = sample_inv_depths(
         scene.views, scene.pixels[0], INV_DEPTHS.to(dtype), image_size=IMAGE_SIZE
     )
-    features = torch.rand(4, 1, 1, 6, 12, 16, dtype=dtype)
-    scores = correlate(torch.rand(2, 3, 6, dtype=dtype), features, samples, image_size=IMAGE_SIZE)
-    assert scores.shape == (4, 2, 1, 3, 1, 31) and scores.dtype == dtype
+    scores = torch.rand(4, 2, 1, 3, 1, 31, dtype=dtype)
     matches = match_joint(scene.views, scene.pixels[0], scores, samples, image_size=IMAGE_SIZE)
     assert matches.pixels.shape == (4, 2, 2, 3, 2) and matches.weights.shape == (4, 2, 2, 3)
     matches = match_per_view(scene.pixels[0], scores, samples, window=3)
@@ -65,35 +50,9 @@ def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
 
 
 def test_no_keypoints_are_no_error() -> None:
-    samples = all_read(torch.zeros(0, 2))
-    scores = correlate(torch.zeros(0, 3), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
-    assert scores.shape == (1, 0, 1, 1)
-    assert match_per_view(torch.zeros(0, 2), scores, samples).pixels.shape == (2, 0, 2)
-
-
-@given(
-    pixels=image_pixels(5, image_size=(24, 32)),
-    descriptors=vectors(5, within=1.0, size=3),
-    features=vectors(48, within=1.0, size=3),
-)
-def test_correlating_then_sampling_is_sampling_then_correlating(
-    pixels: Tensor, descriptors: Tensor, features: Tensor
-) -> None:
-    feature_map = features.mT.reshape(1, 3, 6, 8)
-    scores = correlate(descriptors, feature_map, all_read(pixels), image_size=(24, 32))
-    read = sample_map(feature_map[0], pixels, image_size=(24, 32))
-    assert_close(scores[0, :, 0, 0], (descriptors * read).sum(dim=-1), rtol=0, atol=1e-12)
-
-
-def test_many_keypoints_correlate_as_few_do() -> None:
-    generator = torch.Generator().manual_seed(0)
-    pixels = torch.rand(300, 2, generator=generator) * 32
-    descriptors = torch.rand(300, 2, generator=generator)
-    features = torch.rand(1, 2, 64, 64, generator=generator)
-    together = correlate(descriptors, features, all_read(pixels), image_size=(32, 32))
-    for some in (slice(0, 7), slice(60, 200)):
-        alone = correlate(descriptors[some], features, all_read(pixels[some]), image_size=(32, 32))
-        assert_close(together[:, some], alone, rtol=1e-6, atol=1e-6)
+    places = torch.zeros(1, 0, 1, 1, 2)
+    samples = Samples(places, places[..., 0, 0], places[..., 0].bool())
+    assert match_per_view(torch.zeros(0, 2), places[..., 0], samples).pixels.shape == (2, 0, 2)
 
 
 @given(positions=vectors(7, within=100.0, size=2), place=st.integers(0, 6))
@@ -238,10 +197,3 @@ def test_gradients_are_right() -> None:
             return tuple(soft_argmax(logits, positions, mask=mask, window=window))
 
         assert torch.autograd.gradcheck(moments, (random(5), random(5, 2)))
-
-    places = all_read((random(3, 2) * 6 + 1).detach())
-
-    def scores(descriptors: Tensor, features: Tensor) -> Tensor:
-        return correlate(descriptors, features, places, image_size=(8, 8))
-
-    assert torch.autograd.gradcheck(scores, (random(3, 2), random(1, 2, 4, 4)))

@@ -7,7 +7,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.null_vector import NullVector, Symmetric4, dot, multiply, null_vector
+from deltas_geom.null_vector import (
+    NullVector,
+    Symmetric4,
+    Vector4,
+    dot,
+    multiply,
+    null_vector,
+    rayleigh_step,
+    unit,
+)
 from deltas_geom.testing.strategies import vectors
 
 ROWS, COLUMNS = torch.triu_indices(4, 4)
@@ -19,8 +28,19 @@ def packed(matrix: Tensor) -> Symmetric4:
 
 
 def found(matrix: Tensor) -> tuple[Tensor, NullVector]:
+    """The vector of unit length with its derivatives, last coordinate not negative."""
     result = null_vector(packed(matrix))
-    return torch.stack(result.vector, dim=-1), result
+    start = torch.stack(unit(result.vector), dim=-1)
+    start = torch.where(start[..., 3:] < 0, -start, start)
+    easy = torch.tensor([0, 0, 0, 1], dtype=start.dtype)
+    start = torch.where(start.isfinite().all(dim=-1, keepdim=True), start, easy)
+    step = rayleigh_step(packed(matrix), of(start))
+    return torch.stack(unit(step), dim=-1), result
+
+
+def of(vector: Tensor) -> Vector4:
+    x0, x1, x2, x3 = vector.unbind(dim=-1)
+    return x0, x1, x2, x3
 
 
 @st.composite

@@ -12,7 +12,12 @@ from torch.testing import assert_close
 
 from deltas_geom import PosedViews, ShapeError, pixel_rays, project, unproject
 from deltas_geom.testing import PosedScene, forward_motion, rigid
+from deltas_geom.testing.invariants import INVARIANTS, World
 from deltas_geom.testing.strategies import extreme, posed_scenes, scales, vectors
+from deltas_geom.testing.targets import deltas
+
+OURS = deltas()
+EXACT = ["pixels_are_those_of_the_camera_equations", "pixels_follow_a_crop_and_a_resize"]
 
 
 def test_wrong_shapes_are_named() -> None:
@@ -43,6 +48,12 @@ def test_unprojection_undoes_projection(scene: PosedScene) -> None:
     assert_close(back, scene.points.expand_as(back), rtol=0, atol=1e-12)  # m
 
 
+@given(scene=posed_scenes())
+@pytest.mark.parametrize("name", EXACT)
+def test_pixels_are_exact(name: str, scene: PosedScene) -> None:
+    INVARIANTS[name](OURS, scene, tolerance=1e-8)  # px
+
+
 @given(
     scene=posed_scenes(),
     turn=vectors(1, within=3.0),
@@ -52,13 +63,10 @@ def test_unprojection_undoes_projection(scene: PosedScene) -> None:
 def test_pixels_do_not_know_the_worlds_origin_axes_or_unit(
     scene: PosedScene, turn: Tensor, shift: Tensor, scale: float
 ) -> None:
-    new_from_world = rigid(turn, shift)[0]
-    points = scale * (scene.points @ new_from_world[:3, :3].mT + new_from_world[:3, 3])
-    cam_from_new = scene.views.cam_from_world @ torch.linalg.inv(new_from_world)
-    cam_from_new[:, :3, 3] *= scale
-    moved = project(PosedViews(scene.views.K, cam_from_new), points)
-    assert_close(moved.pixels, scene.pixels, rtol=0, atol=1e-8)  # px
-    assert_close(moved.depth, scale * project(scene.views, scene.points).depth, rtol=1e-9, atol=0)
+    world = World(rigid(turn, shift)[0], scale)
+    INVARIANTS["pixels_do_not_know_the_worlds_frame"](OURS, scene, world=world, tolerance=1e-8)
+    depth = project(world.views(scene.views), world.points(scene.points)).depth
+    assert_close(depth, scale * project(scene.views, scene.points).depth, rtol=1e-9, atol=0)
 
 
 @given(scene=posed_scenes(), depth=st.floats(-5, 5))

@@ -8,18 +8,17 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import ShapeError, SparseDepth, rasterize_depth
-from deltas_geom.testing.strategies import extreme, image_pixels, vectors
+from deltas_geom.testing.invariants import INVARIANTS
+from deltas_geom.testing.planar import DepthScene
+from deltas_geom.testing.strategies import depth_scenes, extreme
+from deltas_geom.testing.target import Target
+from deltas_geom.testing.targets import deltas
 
 SIZE = (4, 5)
+OURS = deltas()
+DRAWN = [name for name, invariant in INVARIANTS.items() if invariant.scenes == "depths"]
+OF_ANY = [name for name in DRAWN if INVARIANTS[name].needs == ("drawing",)]
 KINDS = [(reduce, splat) for reduce in ("front", "mean") for splat in ("pixel", "bilinear")]
-
-
-@st.composite
-def clouds(draw: st.DrawFn, count: int = 8) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels in and around a tiny image, so that they collide; distinct depths; weights."""
-    pixels = 1.2 * draw(image_pixels(count, image_size=SIZE))
-    depth = torch.arange(1.0, count + 1).double()[draw(st.permutations(range(count)))]
-    return pixels, depth, 0.6 + draw(vectors(1, within=0.4, size=count))[0]
 
 
 def rasterize(cloud: tuple[Tensor, Tensor, Tensor], kind: tuple[str, str]) -> SparseDepth:
@@ -33,6 +32,16 @@ def rasterize(cloud: tuple[Tensor, Tensor, Tensor], kind: tuple[str, str]) -> Sp
         reduce=reduce,  # type: ignore[arg-type]
         splat=splat,  # type: ignore[arg-type]
     )
+
+
+def front_splat(
+    pixels: Tensor, depth: Tensor, weights: Tensor, image_size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    found = rasterize_depth(pixels, depth, image_size=image_size, weights=weights, splat="bilinear")
+    return found.depth[0], found.weight[0]
+
+
+FRONT_SPLAT = Target("front, bilinear", splat=front_splat)
 
 
 def test_wrong_arguments_are_named() -> None:
@@ -64,63 +73,30 @@ def test_no_points_are_an_empty_image(kind: tuple[str, str]) -> None:
     assert sparse.depth.shape == (1, 4, 5) and (sparse.depth == 0).all()
 
 
-@given(cloud=clouds(), order=st.permutations(range(8)))
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_order_of_points_does_not_count(
-    kind: tuple[str, str], cloud: tuple[Tensor, Tensor, Tensor], order: list[int]
-) -> None:
-    one = rasterize(cloud, kind)
-    pixels, depth, weights = cloud
-    other = rasterize((pixels[order], depth[order], weights[order]), kind)
-    assert_close(other.depth, one.depth, rtol=0, atol=1e-12)  # m
-    assert_close(other.weight, one.weight, rtol=0, atol=1e-12)
+@given(scene=depth_scenes())
+@pytest.mark.parametrize("name", DRAWN)
+def test_each_way_of_drawing_is_right(name: str, scene: DepthScene) -> None:
+    INVARIANTS[name](OURS, scene)
 
 
-@given(pixels=vectors(8, within=0.5, size=2), weights=vectors(1, within=0.4, size=8))
-def test_mass_is_conserved(pixels: Tensor, weights: Tensor) -> None:
-    inside = (pixels + 0.5) * torch.tensor([4.0, 3.0]).double()  # among the outer centres
-    masses = weights[0] + 0.5
-    depth = torch.linspace(1, 2, 8).double()
-    sparse = rasterize((inside, depth, masses), ("mean", "bilinear"))
-    assert_close(sparse.weight.sum(), masses.sum(), rtol=0, atol=1e-12)
-    moment = (sparse.weight * sparse.depth).sum()
-    assert_close(moment, (masses * depth).sum(), rtol=0, atol=1e-12)
+@given(scene=depth_scenes(), order=st.permutations(range(8)))
+def test_the_order_of_points_does_not_count(scene: DepthScene, order: list[int]) -> None:
+    for target in (OURS, FRONT_SPLAT):
+        INVARIANTS["the_order_of_points_does_not_count"](target, scene, order=order)
 
 
-@given(cloud=clouds())
-def test_the_nearest_wins(cloud: tuple[Tensor, Tensor, Tensor]) -> None:
-    pixels, depth, weights = cloud
-    sparse = rasterize(cloud, ("front", "pixel"))
-    cells = (pixels + 0.5).floor()
-    for row in range(4):
-        for column in range(5):
-            here = (cells == torch.tensor([column, row])).all(dim=-1)
-            wanted = depth[here].min().item() if here.any() else 0.0
-            assert sparse.depth[0, row, column] == wanted
-            weight = weights[here][depth[here].argmin()].item() if here.any() else 0.0
-            assert sparse.weight[0, row, column] == weight
+@given(scene=depth_scenes())
+@pytest.mark.parametrize("name", OF_ANY)
+def test_the_nearest_of_bilinear_splats_is_right(name: str, scene: DepthScene) -> None:
+    INVARIANTS[name](FRONT_SPLAT, scene)
 
 
-@given(cloud=clouds())
-def test_the_mean_is_weighted(cloud: tuple[Tensor, Tensor, Tensor]) -> None:
-    pixels, depth, weights = cloud
-    sparse = rasterize(cloud, ("mean", "pixel"))
-    cells = (pixels + 0.5).floor()
-    for row in range(4):
-        for column in range(5):
-            here = (cells == torch.tensor([column, row])).all(dim=-1)
-            total = weights[here].sum()
-            wanted = (weights[here] * depth[here]).sum() / total if here.any() else total
-            assert_close(sparse.depth[0, row, column], wanted, rtol=0, atol=1e-12)  # m
-            assert_close(sparse.weight[0, row, column], total, rtol=0, atol=1e-12)
-
-
-@given(cloud=clouds(), unused=st.integers(0, 7))
+@given(scene=depth_scenes(), unused=st.integers(0, 7))
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_masked_point_is_a_point_removed(
-    kind: tuple[str, str], cloud: tuple[Tensor, Tensor, Tensor], unused: int
+    kind: tuple[str, str], scene: DepthScene, unused: int
 ) -> None:
-    pixels, depth, weights = (value.clone() for value in cloud)
+    pixels, depth, weights = (value.clone() for value in scene[:3])
     rest = torch.arange(8) != unused
     wanted = rasterize((pixels[rest], depth[rest], weights[rest]), kind)
     for spoilt, value in ((pixels, torch.nan), (depth, torch.inf), (weights, torch.nan)):

@@ -12,36 +12,32 @@ from deltas_geom import (
     ShapeError,
     epipolar_segments,
     in_image,
-    pixel_grid,
-    project,
     sample_inv_depths,
     sample_map,
     sample_segments,
-    unproject,
 )
 from deltas_geom.testing import PosedScene, forward_motion
+from deltas_geom.testing.invariants import INVARIANTS
+from deltas_geom.testing.planar import MapScene
 from deltas_geom.testing.scenes import IMAGE_SIZE
-from deltas_geom.testing.strategies import extreme, image_pixels, posed_scenes, vectors
+from deltas_geom.testing.strategies import extreme, map_scenes, posed_scenes, rigs, vectors
+from deltas_geom.testing.targets import deltas
 
 SPACINGS = ["inv_depth", "pixels"]
+OURS = deltas()
+ALONG = [
+    "samples_are_seen_at_their_inverse_depths",
+    "samples_run_from_the_far_to_the_near_end",
+    "samples_are_even_in_inverse_depth",
+    "samples_are_even_in_pixels",
+]
+READ = [name for name, invariant in INVARIANTS.items() if "sample_map" in invariant.needs]
 
 
 def segments_of(scene: PosedScene, near: float = 0.7, far: float = 20.0) -> Segments:
     return epipolar_segments(
         scene.views, scene.pixels[0], depth_range=(near, far), image_size=IMAGE_SIZE
     )
-
-
-def project_inv_depths(scene: PosedScene, inv_depth: Tensor) -> Tensor:
-    """Direct projection of the anchor's pixels at ``(V-1, N, S)`` 1/m: ``(V-1, N, S, 2)``."""
-    sources = []
-    for source, inverse in enumerate(inv_depth, start=1):
-        columns = []
-        for depth in (1 / inverse).unbind(dim=-1):
-            points = unproject(scene.views.select(0), scene.pixels[:1], depth[None])[0]
-            columns.append(project(scene.views.select(source), points).pixels[0])
-        sources.append(torch.stack(columns, dim=-2))
-    return torch.stack(sources)
 
 
 def test_wrong_arguments_are_named() -> None:
@@ -82,40 +78,31 @@ def test_no_keypoints_are_no_error() -> None:
     )
 
 
-@given(scene=posed_scenes(num_views=3))
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_samples_agree_with_direct_projection_at_their_inverse_depths(
-    spacing: str, scene: PosedScene
-) -> None:
-    segments = segments_of(scene)
-    samples = sample_segments(segments, 5, spacing=spacing)  # type: ignore[arg-type]
-    wanted = project_inv_depths(scene, samples.inv_depth.clamp(min=0.05))
-    offset = torch.where(samples.mask[..., 0, :, None], samples.pixels.squeeze(-3) - wanted, 0.0)
-    assert_close(offset, torch.zeros_like(offset), rtol=0, atol=1e-6)  # px
+@given(scene=posed_scenes(), count=st.integers(2, 9))
+@pytest.mark.parametrize("name", ALONG)
+def test_samples_run_evenly_over_what_is_visible(name: str, scene: PosedScene, count: int) -> None:
+    INVARIANTS[name](OURS, scene, count=count)
+
+
+@given(scene=rigs(), pixels=extreme(3, 2))
+def test_samples_are_finite(scene: PosedScene, pixels: Tensor) -> None:
+    INVARIANTS["samples_are_finite"](OURS, scene, pixels=pixels)
 
 
 @given(scene=posed_scenes(num_views=3))
 @pytest.mark.parametrize("spacing", SPACINGS)
-def test_samples_run_evenly_from_far_to_near(spacing: str, scene: PosedScene) -> None:
+def test_the_outer_samples_are_the_ends(spacing: str, scene: PosedScene) -> None:
     segments = segments_of(scene)
     samples = sample_segments(segments, 6, spacing=spacing)  # type: ignore[arg-type]
-    steps = samples.inv_depth.diff(dim=-1)
-    assert ((steps > 0) | ~segments.visible[..., None]).all()
     assert_close(samples.pixels[..., 0, 0, :], segments.start, rtol=0, atol=0)
     assert_close(samples.pixels[..., 0, -1, :], segments.end, rtol=0, atol=1e-9)  # px
     assert_close(samples.inv_depth[..., -1], segments.inv_depth_end, rtol=1e-12, atol=0)
-    if spacing == "pixels":
-        steps = samples.pixels.squeeze(-3).diff(dim=-2).norm(dim=-1)
-    assert_close(steps, steps[..., :1].expand_as(steps), rtol=1e-6, atol=1e-9)
 
 
-@given(scene=posed_scenes(), inverse=vectors(1, within=0.5, size=4))
-def test_common_inverse_depths_agree_with_projection(scene: PosedScene, inverse: Tensor) -> None:
-    inv_depths = 0.6 + inverse[0]  # 1/m
-    samples = sample_inv_depths(scene.views, scene.pixels[0], inv_depths, image_size=IMAGE_SIZE)
-    wanted = project_inv_depths(scene, samples.inv_depth)
-    assert_close(samples.pixels.squeeze(-3), wanted, rtol=0, atol=1e-8)  # px
-    assert (samples.mask.squeeze(-2) == in_image(wanted, image_size=IMAGE_SIZE)).all()
+@given(scene=st.one_of(posed_scenes(), rigs()), inverse=vectors(1, within=0.6, size=4))
+def test_common_inverse_depths_are_seen_where_they_are(scene: PosedScene, inverse: Tensor) -> None:
+    inv_depth = 0.6 + inverse[0]  # 1/m, from infinity to 0.8 m
+    INVARIANTS["a_sweep_sees_each_inverse_depth_where_it_is"](OURS, scene, inv_depth=inv_depth)
 
 
 @given(scene=posed_scenes())
@@ -141,20 +128,15 @@ def test_offset_samples_beyond_the_image_are_masked() -> None:
     assert not samples.mask[..., 0, :].any() and samples.mask[..., 1, 1:-1].all()
 
 
-@given(
-    pixels=image_pixels(5, image_size=(24, 32)),
-    slope=vectors(1, within=1.0),
-    stride=st.sampled_from([1, 2, 4, 8]),
-)
-def test_a_linear_field_is_sampled_exactly(pixels: Tensor, slope: Tensor, stride: int) -> None:
-    size = (24 // stride, 32 // stride)
-    places = (pixel_grid(size, dtype=torch.float64) + 0.5) * stride - 0.5
-    field = (places @ slope[0, :2] + slope[0, 2]).reshape(1, *size)
-    # Between the centres of the outer cells; beyond them the border continues.
-    low, high = places.amin(dim=0), places.amax(dim=0)
-    inner = torch.minimum(torch.maximum(pixels, low), high)
-    read = sample_map(field, pixels, image_size=(24, 32))[:, 0]
-    assert_close(read, inner @ slope[0, :2] + slope[0, 2], rtol=0, atol=1e-12)
+@given(scene=map_scenes(), slope=vectors(1, within=1.0, size=2))
+def test_a_linear_field_is_sampled_exactly(scene: MapScene, slope: Tensor) -> None:
+    INVARIANTS["a_linear_field_is_read_exactly"](OURS, scene, slope=tuple(slope[0].tolist()))
+
+
+@given(scene=map_scenes())
+@pytest.mark.parametrize("name", READ)
+def test_maps_are_read_bilinearly(name: str, scene: MapScene) -> None:
+    INVARIANTS[name](OURS, scene)
 
 
 @given(pixels=extreme(4, 2))

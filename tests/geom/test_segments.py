@@ -16,41 +16,46 @@ from deltas_geom import (
     epipolar_segments,
     fundamental_between,
     in_image,
-    project,
-    resize_pixels,
-    unproject,
 )
-from deltas_geom.testing import default_intrinsics, forward_motion, pure_rotation, zero_baseline
+from deltas_geom.testing import (
+    PosedScene,
+    default_intrinsics,
+    forward_motion,
+    pure_rotation,
+    rigid,
+    zero_baseline,
+)
+from deltas_geom.testing.invariants import INVARIANTS, World
 from deltas_geom.testing.scenes import IMAGE_SIZE
-from deltas_geom.testing.strategies import extreme, image_pixels, intrinsics, poses
+from deltas_geom.testing.sights import sights
+from deltas_geom.testing.strategies import (
+    depth_ranges,
+    extreme,
+    posed_scenes,
+    rigs,
+    scales,
+    vectors,
+)
+from deltas_geom.testing.target import DepthRange
+from deltas_geom.testing.targets import deltas
+
+OURS = deltas()
+CLIPPED = [
+    "segment_ends_are_visible_depths_of_the_range",
+    "every_visible_depth_lies_on_the_segment",
+    "segments_follow_a_resize",
+]
+POSED = [
+    "a_segment_out_of_sight_is_flagged",
+    "without_a_baseline_a_segment_is_a_point",
+    "a_keypoint_at_the_epipole_stays_there",
+]
 
 
-@st.composite
-def rigs(draw: st.DrawFn) -> tuple[PosedViews, Tensor, tuple[float, float]]:
-    """Three cameras within a metre, turned by up to a radian; keypoints; a depth range."""
-    views = PosedViews(draw(intrinsics(3)), draw(poses(3, turn=0.6, shift=0.5)))
-    near = draw(st.floats(0.2, 2.0))
-    far = draw(st.one_of(st.just(float("inf")), st.floats(1.5, 20).map(lambda share: near * share)))
-    return views, draw(image_pixels(3)), (near, far)
-
-
-def at_depth(views: PosedViews, pixels: Tensor, inv_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Direct projection of anchor pixels ``(N, 2)`` at ``(V-1, N)`` 1/m: pixels, visible."""
-    anchor = views.select(0)
-    # A depth of 1e9 m stands in for infinity: it moves a pixel by 1e-6 px at most.
-    depth = 1 / inv_depth.clamp(min=1e-9)
-    places, visible = [], []
-    for source in range(depth.shape[0]):
-        points = unproject(anchor, pixels[None], depth[source][None])[0]
-        seen = project(views.select(source + 1), points)
-        places.append(seen.pixels[0])
-        visible.append(seen.in_front[0] & in_image(seen.pixels[0], image_size=IMAGE_SIZE))
-    return torch.stack(places), torch.stack(visible)
-
-
-def segments_of(rig: tuple[PosedViews, Tensor, tuple[float, float]]) -> Segments:
-    views, pixels, depth_range = rig
-    return epipolar_segments(views, pixels, depth_range=depth_range, image_size=IMAGE_SIZE)
+def segments_of(scene: PosedScene, depth_range: DepthRange) -> Segments:
+    return epipolar_segments(
+        scene.views, scene.pixels[0], depth_range=depth_range, image_size=IMAGE_SIZE
+    )
 
 
 def test_wrong_arguments_are_named() -> None:
@@ -70,117 +75,95 @@ def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
 
 
 def test_no_keypoints_are_no_error() -> None:
-    segments = segments_of((forward_motion().views, torch.zeros(0, 2).double(), (1.0, 2.0)))
+    segments = epipolar_segments(
+        forward_motion().views,
+        torch.zeros(0, 2).double(),
+        depth_range=(1, 2),
+        image_size=IMAGE_SIZE,
+    )
     assert segments.start.shape == (1, 0, 2)
 
 
-@given(rig=rigs())
-def test_ends_are_the_projections_of_the_clamped_depths(
-    rig: tuple[PosedViews, Tensor, tuple[float, float]],
+@given(scene=rigs(), depth_range=depth_ranges())
+@pytest.mark.parametrize("name", CLIPPED)
+def test_the_segment_is_what_is_visible(
+    name: str, scene: PosedScene, depth_range: DepthRange
 ) -> None:
-    views, pixels, (near, far) = rig
-    segments = segments_of(rig)
+    INVARIANTS[name](OURS, scene, depth_range=depth_range)
+
+
+@given(scene=posed_scenes(), depth_range=depth_ranges())
+@pytest.mark.parametrize("name", POSED)
+def test_degenerate_rigs_have_their_status(
+    name: str, scene: PosedScene, depth_range: DepthRange
+) -> None:
+    INVARIANTS[name](OURS, scene, depth_range=depth_range)
+
+
+@given(
+    scene=rigs(),
+    depth_range=depth_ranges(),
+    turn=vectors(1, within=3.0),
+    shift=vectors(1, within=10.0),
+    scale=scales(),
+)
+def test_segments_do_not_know_the_worlds_frame(
+    scene: PosedScene, depth_range: DepthRange, turn: Tensor, shift: Tensor, scale: float
+) -> None:
+    INVARIANTS["segments_do_not_know_the_worlds_frame"](
+        OURS, scene, depth_range=depth_range, world=World(rigid(turn, shift)[0], scale)
+    )
+
+
+@given(scene=rigs(), left=st.integers(0, 320), top=st.integers(0, 240))
+def test_a_crop_of_the_source_clips_segments(scene: PosedScene, left: int, top: int) -> None:
+    INVARIANTS["a_crop_of_the_source_clips_segments"](OURS, scene, left=left, top=top)
+
+
+@given(scene=rigs(), depth_range=depth_ranges())
+def test_the_stated_inverse_depths_are_those_of_the_ends(
+    scene: PosedScene, depth_range: DepthRange
+) -> None:
+    segments = segments_of(scene, depth_range)
     for end, inv_depth in (
         (segments.start, segments.inv_depth_start),
         (segments.end, segments.inv_depth_end),
     ):
-        within = (inv_depth >= 1 / far - 1e-12) & (inv_depth <= 1 / near + 1e-12)
-        assert (within | ~segments.visible).all()
-        place, _ = at_depth(views, pixels, inv_depth)
-        # An end far out along the camera's plane is clipped by the image, so px are px.
-        offset = torch.where(segments.visible[..., None], place - end, 0.0)
-        assert_close(offset, torch.zeros_like(offset), rtol=0, atol=1e-5)  # px
-        outside = ~in_image(end, image_size=IMAGE_SIZE, border=-1e-6)
-        assert not (outside & segments.visible).any()
-
-
-@given(rig=rigs())
-def test_every_visible_depth_lies_on_the_segment_and_no_other(
-    rig: tuple[PosedViews, Tensor, tuple[float, float]],
-) -> None:
-    views, pixels, (near, far) = rig
-    segments = segments_of(rig)
-    start, end = segments.inv_depth_start, segments.inv_depth_end
-    along = segments.end - segments.start
-    for share in torch.linspace(0, 1, 33, dtype=torch.float64):
-        inv_depth = (1 / far + share * (1 / near - 1 / far)).expand_as(start)
-        place, visible = at_depth(views, pixels, inv_depth)
-        inside = segments.visible & (inv_depth >= start) & (inv_depth <= end)
-        at_an_end = ((inv_depth - start).abs() < 1e-8) | ((inv_depth - end).abs() < 1e-8)
-        # Visible only at one depth, as when a line touches the corner: no sample to compare.
-        assert ((inside == visible) | at_an_end | (visible & ~segments.visible & at_an_end)).all()
-        # Its distance from the segment, not only from the line.
-        offset = place - segments.start
-        length = along.square().sum(dim=-1)
-        foot = (offset * along).sum(dim=-1) / length.clamp(min=1e-30)
-        nearest = segments.start + foot.clamp(0, 1)[..., None] * along
-        distance = (place - nearest).norm(dim=-1)
-        assert (torch.where(visible & ~at_an_end, distance, 0.0) < 1e-6).all()  # px
-
-
-@given(rig=rigs())
-def test_both_ends_lie_on_the_epipolar_line(
-    rig: tuple[PosedViews, Tensor, tuple[float, float]],
-) -> None:
-    views, pixels, _ = rig
-    segments = segments_of(rig)
-    for source in (1, 2):
-        # A short baseline defines the line badly; the constraint itself is in metres.
-        fundamental = fundamental_between(views, source=source)
-        for end in (segments.start[source - 1], segments.end[source - 1]):
-            distance = epipolar_distance(fundamental, pixels, end)
-            short = (views.proj[source] - views.proj[0])[:, 3].abs().amax() < 1e-3
-            distance = torch.where(segments.visible[source - 1], distance, 0.0)
-            assert short or (distance.abs() < 1e-4).all()  # px
-
-
-@given(rig=rigs())
-def test_segments_are_equivariant_to_resizing(
-    rig: tuple[PosedViews, Tensor, tuple[float, float]],
-) -> None:
-    views, pixels, depth_range = rig
-    segments = segments_of(rig)
-    small = epipolar_segments(
-        views.resize(old_size=IMAGE_SIZE, new_size=(120, 320)),
-        resize_pixels(pixels, old_size=IMAGE_SIZE, new_size=(120, 320)),
-        depth_range=depth_range,
-        image_size=(120, 320),
-    )
-    both = small.visible & segments.visible
-    # A single visible depth may or may not survive rounding.
-    lone = (segments.inv_depth_end - segments.inv_depth_start).abs() < 1e-9
-    lone = lone & ((small.inv_depth_end - small.inv_depth_start).abs() < 1e-9)
-    assert ((small.visible == segments.visible) | lone).all()
-    for name in ("start", "end"):
-        wanted = resize_pixels(getattr(segments, name), old_size=IMAGE_SIZE, new_size=(120, 320))
-        offset = torch.where(both[..., None], getattr(small, name) - wanted, 0.0)
+        place, _ = sights(scene.views, scene.pixels[0]).seen(inv_depth.mT, IMAGE_SIZE)
+        offset = torch.where(segments.visible[0, :, None], place[:, 0] - end[0], 0.0)
         assert_close(offset, torch.zeros_like(offset), rtol=0, atol=1e-5)  # px
 
 
-@given(rig=rigs())
-def test_float32_is_within_its_bound_of_float64(
-    rig: tuple[PosedViews, Tensor, tuple[float, float]],
-) -> None:
-    views, pixels, depth_range = rig
-    single = epipolar_segments(
-        views.to(torch.float32), pixels.float(), depth_range=depth_range, image_size=IMAGE_SIZE
-    )
-    assert in_image(single.start[single.visible], image_size=IMAGE_SIZE, border=-0.01).all()
-    assert in_image(single.end[single.visible], image_size=IMAGE_SIZE, border=-0.01).all()
-    # Where both see it, the stated inverse depth belongs to the stated pixel: 64 roundings of
-    # 1000 px, more where the source's depth is a small part of the anchor's.
+@given(scene=rigs(), depth_range=depth_ranges())
+def test_both_ends_lie_on_the_epipolar_line(scene: PosedScene, depth_range: DepthRange) -> None:
+    segments = segments_of(scene, depth_range)
+    # A short baseline defines the line badly; the constraint itself is in metres.
+    fundamental = fundamental_between(scene.views)
+    short = (scene.views.proj[1] - scene.views.proj[0])[:, 3].abs().amax() < 1e-3
+    for end in (segments.start[0], segments.end[0]):
+        distance = epipolar_distance(fundamental, scene.pixels[0], end)
+        distance = torch.where(segments.visible[0], distance, 0.0)
+        assert short or (distance.abs() < 1e-4).all()  # px
+
+
+@given(scene=rigs(), depth_range=depth_ranges())
+def test_float32_is_within_its_bound_of_float64(scene: PosedScene, depth_range: DepthRange) -> None:
+    views, keypoints = scene.views, scene.pixels[0]
+    half = scene._replace(views=views.to(torch.float32), pixels=scene.pixels.float())
+    single = segments_of(half, depth_range)
     for end, inv_depth in (
-        (single.start, single.inv_depth_start),
-        (single.end, single.inv_depth_end),
+        (single.start[0], single.inv_depth_start[0].double()),
+        (single.end[0], single.inv_depth_end[0].double()),
     ):
-        place, _ = at_depth(views, pixels, inv_depth.double())
-        anchors = views.select([0, 0])
-        points = unproject(anchors, pixels.expand(2, 3, 2), 1 / inv_depth.double().clamp(1e-9))
-        depth = torch.stack([project(views, points[i]).depth[i + 1] for i in range(2)])
-        share = (depth * inv_depth.double()).abs().amin()
-        bound = 64 * 6e-8 * 1000 / share.clamp(min=1e-3)
-        offset = torch.where(single.visible, (place - end.double()).norm(dim=-1), 0.0)
-        assert (share < 1e-3) or (offset < bound).all()
+        assert in_image(end[single.visible[0]], image_size=IMAGE_SIZE, border=-0.01).all()
+        # The stated inverse depth belongs to the stated pixel: 64 roundings of 1000 px, more
+        # where the source's depth is a small part of the anchor's.
+        homogeneous = sights(views, keypoints).at(inv_depth[:, None])[:, 0]
+        share = homogeneous[:, 2].abs().clamp(min=1e-3)
+        offset = homogeneous[:, :2] / homogeneous[:, 2:] - end.double()
+        bound = 64 * 6e-8 * 1000 / share
+        ok = ~single.visible[0] | (share <= 1e-3) | (offset.norm(dim=-1) < bound)
+        assert ok.all()
 
 
 @given(pixels=extreme(4, 2))
@@ -216,26 +199,19 @@ def test_gradients_are_right() -> None:
 
 
 @pytest.mark.parametrize("scene", [zero_baseline(), pure_rotation()])
-def test_without_a_baseline_a_segment_is_a_point(scene) -> None:  # type: ignore[no-untyped-def]
-    segments = segments_of((scene.views, scene.pixels[0], (0.5, 10.0)))
+def test_without_a_baseline_a_segment_is_a_point(scene: PosedScene) -> None:
+    segments = segments_of(scene, (0.5, 10.0))
     assert (segments.status == Status.NO_PARALLAX).all() and segments.visible.all()
     assert_close(segments.start[0], scene.pixels[1], rtol=0, atol=1e-9)  # px
 
 
 def test_moving_forward_segments_run_away_from_the_epipole() -> None:
     scene = forward_motion()
-    segments = segments_of((scene.views, scene.pixels[0], (0.6, float("inf"))))
+    segments = segments_of(scene, (0.6, float("inf")))
     epipole = torch.tensor([320.0, 240.0]).double()
     outward = (segments.end - epipole).norm(dim=-1) > (segments.start - epipole).norm(dim=-1)
     assert outward.all() and (segments.status == Status.OK).all()
     assert_close(segments.start[0], scene.pixels[0], rtol=0, atol=1e-9)  # infinity stays, px
-
-
-def test_a_keypoint_at_the_epipole_stays_there() -> None:
-    segments = segments_of(
-        (forward_motion().views, torch.tensor([[320.0, 240.0]]).double(), (1, 9))
-    )
-    assert segments.status.item() == Status.NO_PARALLAX
 
 
 def test_a_range_behind_the_source_is_empty_with_zero_gradient() -> None:
@@ -264,5 +240,7 @@ def test_a_keypoint_that_is_nan_spoils_no_gradient() -> None:
 
 def test_an_anchor_alone_has_no_segments() -> None:
     views = PosedViews(default_intrinsics()[None], torch.eye(4).double()[None])
-    segments = segments_of((views, torch.zeros(5, 2).double(), (1.0, 2.0)))
+    segments = epipolar_segments(
+        views, torch.zeros(5, 2).double(), depth_range=(1, 2), image_size=IMAGE_SIZE
+    )
     assert segments.start.shape == (0, 5, 2)

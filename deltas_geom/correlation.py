@@ -1,0 +1,275 @@
+"""Dot products of keypoint descriptors with feature maps, read at places of other views.
+
+Correlation comes first and the scalar map is sampled: bilinear reading is linear, so the result
+is that of reading D channels and then multiplying, at a fraction of the memory. Lengths of read
+features are not linear, but they are polynomials between the pixels and as cheap to read.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.pixels import normalize_pixels, resize_pixels
+from deltas_geom.recompute import recomputed
+from deltas_geom.sampling import Samples
+
+_CACHED_ELEMENTS = 1 << 20  # a chunk should stay in the cache between writing and reading it
+_HELD_ELEMENTS = 1 << 26  # where there is no such cache: what one call may hold in memory
+
+
+def correlate(
+    descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
+) -> Tensor:
+    """Dot products of keypoint descriptors with the sources' features at samples.
+
+    Keeps nothing but its arguments for the backward pass. Arithmetic is in float32 at least,
+    whatever ``torch.autocast`` says: half of its digits would move the best place by pixels.
+
+    Args:
+        descriptors: ``(*B, N, D)`` of the anchor's keypoints.
+        feature_map: ``(*B, V-1, D, h, w)`` of the sources, any stride; beyond the outer centres
+            its border is continued.
+        samples: places in the sources.
+        image_size: (height, width) of the sources' images.
+
+    Returns:
+        ``(*B, V-1, N, O, S)``; 0 with zero gradient where the sample is masked, whatever its
+        pixel holds; elsewhere a pixel that is NaN counts as one beyond the border. ``*B``
+        broadcasts. At least float32.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Source: the paper, equation 1.
+
+    Example:
+        >>> row = torch.tensor([[1.0, 3.0], [0.0, 4.0]]).reshape(1, 2, 1, 2)  # two pixels, D = 2
+        >>> places = torch.tensor([0.0, 0.5, 1.0])[:, None] * torch.tensor([1.0, 0.0])
+        >>> samples = Samples(places[None, None, None], torch.ones(1, 1, 3), torch.tensor(True))
+        >>> correlate(torch.tensor([[2.0, 1.0]]), row, samples, image_size=(1, 2)).squeeze()
+        tensor([ 2.,  6., 10.])
+    """
+    check_shapes(
+        descriptors=(descriptors, "N D"),
+        feature_map=(feature_map, "S D h w"),
+        samples=(samples.pixels, "S N O M 2"),
+    )
+    batch = batch_shape(
+        (*descriptors.shape[:-2], 1), feature_map.shape[:-3], samples.pixels.shape[:-4]
+    )
+    dots = _in_pieces(
+        lambda *piece: _DotProducts.apply(*piece, image_size),  # type: ignore[no-untyped-call]
+        feature_map.expand(*batch, *feature_map.shape[-3:]),
+        descriptors.unsqueeze(-3).expand(*batch, *descriptors.shape[-2:]),
+        samples.pixels.expand(*batch, *samples.pixels.shape[-4:]),
+        elements=feature_map.shape[-2:].numel(),
+    )
+    return torch.where(samples.mask, dots, 0.0)
+
+
+def correlate_normalized(
+    descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
+) -> Tensor:
+    """Dot products with the features brought to unit length *after* they are read.
+
+    Between two pixels a bilinearly read unit feature is shorter than one, the more so the more
+    the two differ, which favours pixel centres in :func:`correlate`. With descriptors of unit
+    length the result is the cosine of the angle, exactly as if D channels had been read.
+
+    Args:
+        descriptors: ``(*B, N, D)`` of the anchor's keypoints.
+        feature_map: ``(*B, V-1, D, h, w)`` of the sources, any stride and any lengths.
+        samples: places in the sources.
+        image_size: (height, width) of the sources' images.
+
+    Returns:
+        ``(*B, V-1, N, O, S)``; 0 with zero gradient where the sample is masked, and where
+        neighbours cancel to a length below 4 sqrt(eps) of their own.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+
+    Example:
+        >>> row = torch.tensor([[1.0, 0.0], [0.0, 1.0]]).reshape(1, 2, 1, 2)  # two pixels, D = 2
+        >>> between = torch.tensor([0.5, 0.0]).reshape(1, 1, 1, 1, 2)
+        >>> samples = Samples(between, torch.ones(1, 1, 1), torch.tensor(True))
+        >>> correlate(torch.tensor([[1.0, 0.0]]), row, samples, image_size=(1, 2)).item()
+        0.5
+        >>> cosine = correlate_normalized(
+        ...     torch.tensor([[1.0, 0.0]]), row, samples, image_size=(1, 2)
+        ... )
+        >>> round(cosine.item(), 4)
+        0.7071
+    """
+    dots = correlate(descriptors, feature_map, samples, image_size=image_size)
+    (table,) = recomputed(_length_table, feature_map)
+    batch = batch_shape(feature_map.shape[:-3], samples.pixels.shape[:-4])
+    scale = _in_pieces(
+        lambda *piece: recomputed(partial(_inverse_lengths, image_size=image_size), *piece)[0],
+        table.expand(*batch, *table.shape[-3:]),
+        samples.pixels.expand(*batch, *samples.pixels.shape[-4:]),
+        elements=samples.pixels.shape[-3:-1].numel() * 2 * table.shape[-3],
+    )
+    return dots * scale
+
+
+def _in_pieces(
+    function: Callable[..., Tensor], maps: Tensor, *keypoints: Tensor, elements: int
+) -> Tensor:
+    """``function(maps, *keypoints)`` by views and chunks of keypoints.
+
+    Args:
+        function: from ``(*B, C, h, w)`` and ``(*B, n, ...)`` to ``(*B, n, O, S)``.
+        maps: ``(*B, C, h, w)``.
+        *keypoints: ``(*B, N, ...)``.
+        elements: that the function holds per keypoint of one view.
+    """
+    if torch.compiler.is_compiling():  # pieces would fix the number of keypoints
+        return function(maps, *keypoints)
+    batch, cached = maps.shape[:-3], maps.device.type == "cpu"
+    if cached and len(batch) > 0 and batch[0] > 0:
+        # unbind and split, not indices: their backward writes every gradient once.
+        views = zip(maps.unbind(), *(tensor.unbind() for tensor in keypoints), strict=True)
+        return torch.stack([_in_pieces(function, *view, elements=elements) for view in views])
+    limit = _CACHED_ELEMENTS if cached else _HELD_ELEMENTS
+    chunk = max(16, limit // max(1, batch.numel() * elements))
+    dim = len(batch)
+    chunks = zip(*(torch.split(tensor, chunk, dim=dim) for tensor in keypoints), strict=True)
+    return torch.cat([function(maps, *some) for some in chunks], dim=dim)
+
+
+class _DotProducts(torch.autograd.Function):
+    """Of features ``(*B, D, h, w)``, descriptors ``(*B, n, D)`` at pixels ``(*B, n, O, S, 2)``.
+
+    Written out and not left to :func:`recomputed`, because the gradients of both factors need
+    no correlation map: a third of the products of the backward pass.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(
+        features: Tensor, descriptors: Tensor, pixels: Tensor, image_size: tuple[int, int]
+    ) -> Tensor:
+        with torch.autocast(features.device.type, enabled=False):
+            flat, rows, grid = _in_full(features, descriptors, pixels, image_size)
+            maps = (rows @ flat).reshape(-1, 1, *features.shape[-2:])
+            read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+        return read.reshape(pixels.shape[:-1])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        *tensors, ctx.image_size = inputs
+        ctx.save_for_backward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        features, descriptors, pixels = ctx.saved_tensors
+        moves = ctx.needs_input_grad[2]
+        with torch.autocast(features.device.type, enabled=False):
+            flat, rows, grid = _in_full(features, descriptors, pixels, ctx.image_size)
+            count, size = grid.shape[0], features.shape[-2:]
+            # Only the gradient of the places reads the values of the maps.
+            maps = rows @ flat if moves else rows.new_zeros(()).expand(count, 1, *size)
+            of_maps, of_grid = torch.ops.aten.grid_sampler_2d_backward(
+                gradient.reshape(count, 1, *pixels.shape[-3:-1]).contiguous(),
+                maps.reshape(count, 1, *size),
+                grid,
+                interpolation_mode=0,  # bilinear
+                padding_mode=1,  # border
+                align_corners=False,
+                output_mask=[True, moves],
+            )
+            of_maps = of_maps.reshape(*rows.shape[:-1], flat.shape[-1])
+            of_features = (rows.mT @ of_maps).reshape(features.shape).to(features.dtype)
+            of_descriptors = (of_maps @ flat.mT).to(descriptors.dtype)
+        if not moves:
+            return of_features, of_descriptors, None, None
+        of_pixels = of_grid.reshape(pixels.shape) * _of_grid(ctx.image_size, like=of_grid)[1]
+        return of_features, of_descriptors, of_pixels.to(pixels.dtype), None
+
+
+def _in_full(
+    features: Tensor, descriptors: Tensor, pixels: Tensor, image_size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Features ``(*B, D, h w)``, descriptors, grid ``(*B n, O, S, 2)`` in float32 at least."""
+    dtype = torch.promote_types(features.dtype, descriptors.dtype)
+    dtype = torch.promote_types(dtype, torch.float32)
+    pixels = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
+    shift, slope = (part.repeat(pixels.shape[-2]) for part in _of_grid(image_size, like=pixels))
+    # One pass along rows of x, y, x, y: four, two numbers wide, take as long as the sampling.
+    grid = torch.addcmul(shift, pixels.flatten(-2), slope).to(dtype)
+    # The backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU). At
+    # the border it has a value and no gradient.
+    grid = grid.nan_to_num(nan=-1.0).reshape(pixels.shape).flatten(0, -4)
+    return features.to(dtype).flatten(-2), descriptors.to(dtype), grid
+
+
+def _of_grid(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Value at pixel (0, 0) and slope of :func:`normalize_pixels`, which is affine."""
+    pixels = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
+    at_zero, at_one = normalize_pixels(pixels, image_size=image_size).unbind()
+    return at_zero.to(like), (at_one - at_zero).to(like)
+
+
+def _length_table(feature_map: Tensor) -> tuple[Tensor]:
+    """What the squared length of a read feature consists of, ``(*B, 9, h, w)``.
+
+    Between a and b it is (1-u) |a|^2 + u |b|^2 - u (1-u) |a - b|^2. Twice, along x and along y,
+    that is a polynomial of 3 x 3 terms, here for the cell right of and below each pixel, y
+    first. Differences, not the products of neighbours: maps are smooth, and small differences
+    keep their digits.
+    """
+
+    def right(values: Tensor) -> Tensor:
+        return torch.cat([values[..., 1:], values[..., -1:]], dim=-1)
+
+    def below(values: Tensor) -> Tensor:
+        return torch.cat([values[..., 1:, :], values[..., -1:, :]], dim=-2)
+
+    def squared(values: Tensor) -> Tensor:
+        return values.square().sum(dim=-3)
+
+    features = feature_map.to(torch.promote_types(feature_map.dtype, torch.float32))
+    along = right(features) - features
+    length, step_x, step_y = squared(features), squared(along), squared(below(features) - features)
+    twist = squared(below(along) - along)
+    of_top = [length, right(length), step_x]
+    of_bottom = [below(value) for value in of_top]
+    return (torch.stack([*of_top, *of_bottom, step_y, right(step_y), twist], dim=-3),)
+
+
+def _inverse_lengths(
+    table: Tensor, pixels: Tensor, *, image_size: tuple[int, int]
+) -> tuple[Tensor]:
+    """One by the length of the feature at pixels ``(*B, n, O, S, 2)``; 0 where it is nothing."""
+    size = (table.shape[-2], table.shape[-1])
+    pixels = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
+    places = resize_pixels(pixels, old_size=image_size, new_size=size).to(table.dtype)
+    x, column = _cell(places[..., 0].flatten(-3), size[1])
+    y, row = _cell(places[..., 1].flatten(-3), size[0])
+    cell = (row * size[1] + column).unsqueeze(-2).expand(*table.shape[:-2], -1)
+    terms = table.flatten(-2).gather(-1, cell)
+    terms = terms.reshape(*terms.shape[:-2], 3, 3, terms.shape[-1])
+    of_x = torch.stack([1 - x, x, x * (x - 1)], dim=-2).unsqueeze(-3)
+    of_y = torch.stack([1 - y, y, y * (y - 1)], dim=-2)
+    squared = ((terms * of_x).sum(dim=-2) * of_y).sum(dim=-2)
+    with torch.no_grad():
+        ends = (terms[..., :2, :2, :] * of_x[..., :2, :]).sum(dim=-2) * of_y[..., :2, :]
+        has_length = squared > 16 * torch.finfo(squared.dtype).eps * ends.sum(dim=-2)
+    # Double where: the unused branch must not turn the gradient into NaN.
+    inverse = torch.where(has_length, torch.where(has_length, squared, 1.0).rsqrt(), 0.0)
+    return (inverse.reshape(pixels.shape[:-1]),)
+
+
+def _cell(place: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Share of the way to the next centre, and the index of the centre before it."""
+    inside = (place > 0) & (place < size - 1)
+    place = torch.where(inside, place, place.detach().clamp(0, size - 1).nan_to_num(0.0))
+    before = place.detach().floor()
+    return place - before, before.long()

@@ -1,0 +1,214 @@
+"""Cameras and what they see of points, in the solver's type, cleaned and flagged.
+
+Everything downstream may multiply and divide without asking: what is not used is 0 here, and
+passes no NaN and no gradient.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_shapes
+
+# A view whose weight is below this share of the point's largest counts as no view: its squared
+# weight, times a small parallax, would be lost in the rounding of the normal matrix.
+NEGLIGIBLE_WEIGHT = 1e-6
+
+
+Vector3 = tuple[Tensor, Tensor, Tensor]
+"""Components of vectors: struct of arrays, which is fast and compiles into one loop."""
+
+
+def over_views(coefficients: Tensor, values: Tensor) -> tuple[Tensor, ...]:
+    """For K coefficients ``(*B, K, V)`` of views, K sums ``(*B, N)`` of values ``(*B, V, N)``."""
+    if torch.compiler.is_compiling():
+        sums: tuple[Tensor, ...] = _FusedSums.apply(coefficients, values)  # type: ignore[no-untyped-call]
+        return sums
+    return (coefficients @ values).unbind(dim=-2)
+
+
+class _FusedSums(torch.autograd.Function):
+    """The product element by element, which a compiler fuses with what stands around it.
+
+    Its derivative by the coefficients is a sum over points, for which a product is better.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(coefficients: Tensor, values: Tensor) -> tuple[Tensor, ...]:
+        return tuple(_sum_of(row, values) for row in coefficients.unbind(dim=-2))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Any) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        coefficients, values = ctx.saved_tensors
+        gradient = torch.stack(gradients, dim=-2)
+        of_coefficients = of_values = None
+        if ctx.needs_input_grad[0]:
+            of_coefficients = (gradient @ values.mT).sum_to_size(coefficients.shape)
+        if ctx.needs_input_grad[1]:
+            columns = coefficients.unbind(dim=-1)
+            of_values = torch.stack([_sum_of(column, gradient) for column in columns], dim=-2)
+            of_values = of_values.sum_to_size(values.shape)
+        return of_coefficients, of_values
+
+
+def _sum_of(row: Tensor, values: Tensor) -> Tensor:
+    total = row[..., 0, None] * values[..., 0, :]
+    for view in range(1, values.shape[-2]):
+        total = total + row[..., view, None] * values[..., view, :]
+    return total
+
+
+class Weights(NamedTuple):
+    """How much each view counts for each point.
+
+    Attributes:
+        squared: ``(*B, V, N)`` squared weights, a point's largest 1; 0 where unused or unsound.
+        largest: ``(*B, 1, N)`` a point's largest weight; 1 if that is 0.
+        unused: ``(*B, V, N)`` bool.
+        used: ``(*B, V, N)`` its complement as 1 and 0, to be summed.
+        sound: ``(*B, N)`` bool: every used weight is finite, and what it weighs is sound.
+    """
+
+    squared: Tensor
+    largest: Tensor
+    unused: Tensor
+    used: Tensor
+    sound: Tensor
+
+
+def weigh(
+    weights: Tensor | None, mask: Tensor | None, *, batch: torch.Size, like: Tensor, sound: Tensor
+) -> Weights:
+    """Tell used views from unused ones.
+
+    Args:
+        weights: ``(*B, V, N)`` or None for all 1. 0 = unused; the sign has no effect. NaN counts
+            as used.
+        mask: ``(*B, V, N)`` bool or None, True = used.
+        batch: dims to which all are expanded.
+        like: ``(*B, V, N, ...)`` of what is weighed.
+        sound: ``(*B, V, N)`` bool: it can be used.
+    """
+    work = solver_dtype(like)
+    weight = like.new_ones((), dtype=work) if weights is None else weights.to(work)
+    if mask is not None:
+        weight = torch.where(mask, weight, 0.0)
+    weight = weight.expand(*batch, *like.shape[-3:-1])
+    size = weight.detach().abs()
+    largest = size.amax(dim=-2, keepdim=True)
+    unused = size <= NEGLIGIBLE_WEIGHT * largest
+    counted = largest <= torch.finfo(work).max  # NaN is not, either
+    # Double where: an infinite weight must not turn the gradient into NaN.
+    share = torch.where(counted, weight, 0.0) / torch.where(counted & (largest > 0), largest, 1.0)
+    return Weights(
+        squared=torch.where(sound & ~unused, share * share, 0.0),
+        largest=torch.where(counted & (largest > 0), largest, 1.0),
+        unused=unused,
+        used=(~unused).to(work),
+        sound=(sound | unused).all(dim=-2) & counted.squeeze(-2),
+    )
+
+
+class Observations(NamedTuple):
+    """Pixels of N points in V views.
+
+    Attributes:
+        proj: ``(*B, V, 3, 4)``, 0 for cameras that are not finite.
+        sick: ``(*B, V)`` 1 for those, else 0.
+        xy: ``(*B, V, 2, N)`` pixels, 0 where unused or not finite.
+        weights: of the pixels.
+    """
+
+    proj: Tensor
+    sick: Tensor
+    xy: Tensor
+    weights: Weights
+
+
+def observe(
+    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> Observations:
+    """Check shapes, broadcast, and tell used from unused.
+
+    Args:
+        proj: ``(*B, V, 3, 4)``.
+        pixels: ``(*B, V, N, 2)``; those of unused views may hold anything.
+        weights: see :func:`weigh`.
+        mask: see :func:`weigh`.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+    """
+    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
+    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    # Struct of arrays: sums over views then run over memory in order.
+    work = solver_dtype(proj)
+    xy = pixels.mT.to(work, memory_format=torch.contiguous_format)
+    x, y = xy.detach().unbind(dim=-2)
+    limit = torch.finfo(work).max ** 0.25  # what is beyond overflows; NaN is not below
+    sound = x * x + y * y < limit
+    weighed = weigh(weights, mask, batch=batch, like=pixels, sound=sound)
+    finite = (proj.detach().to(work).abs() < limit).all(-1).all(-1)
+    # Double where throughout: what is not used must pass no gradient and no NaN.
+    return Observations(
+        proj=torch.where(finite[..., None, None], proj, 0.0).to(work),
+        sick=(~finite).to(work),
+        xy=torch.where(sound.unsqueeze(-2), xy, 0.0),
+        weights=weighed,
+    )
+
+
+def check_weights(
+    weights: Tensor | None,
+    mask: Tensor | None,
+    name: str,
+    seen: Tensor,
+    dims: str,
+    batch: torch.Size,
+) -> torch.Size:
+    """Raise :class:`ShapeError` unless weights and mask ``(*B, V, N)`` fit what is weighed.
+
+    Returns:
+        The batch dims to which all broadcast.
+    """
+    shapes = [batch, seen.shape[:-3]]
+    for label, tensor in (("weights", weights), ("mask", mask)):
+        if tensor is not None:
+            check_shapes(**{label: (tensor, "V N"), name: (seen, dims)})
+            shapes.append(tensor.shape[:-2])
+    return batch_shape(*shapes)
+
+
+def solver_dtype(tensor: Tensor) -> torch.dtype:
+    """The type to compute in: float64, whatever the input, where the device has it."""
+    # Apple's devices have no float64; there the rig frame alone keeps float32 usable.
+    return torch.float32 if tensor.device.type == "mps" else torch.float64
+
+
+def projection_centers(proj: Tensor) -> Tensor:
+    """Centres ``(*B, V, 3)`` of cameras ``(*B, V, 3, 4)``.
+
+    A camera without a finite centre gets 0 with zero gradient.
+
+    Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
+    """
+    rows = proj[..., :3]
+    r0, r1, r2 = rows.unbind(dim=-2)
+    cofactors = torch.stack(
+        [torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)], dim=-2
+    )
+    determinant = (r0 * cofactors[..., 0, :]).sum(dim=-1)
+    with torch.no_grad():
+        product = rows.square().sum(dim=-1).prod(dim=-1).sqrt()
+        exists = determinant.abs() > 4 * torch.finfo(proj.dtype).eps * product
+    # Double where: a singular camera must not turn the gradient into NaN.
+    inverse = 1 / torch.where(exists, determinant, 1.0)
+    position = torch.where(exists[..., None], proj[..., 3], 0.0)
+    return -inverse[..., None] * (cofactors * position[..., None]).sum(dim=-2)

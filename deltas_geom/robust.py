@@ -1,0 +1,300 @@
+"""Which views are wrong about a point: candidates from pairs of views, judged by all views.
+
+A point has few views, so all pairs are tried where RANSAC would draw some at random.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import check_shapes
+from deltas_geom.homogeneous import to_homogeneous
+from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
+from deltas_geom.status import Status
+from deltas_geom.triangulation import triangulate, triangulate_points
+
+_BUDGET = 2**17  # distances at a time: what lies between stays in the cache
+
+
+class RobustTriangulation(NamedTuple):
+    """The fields of :class:`Triangulation`, of the inliers, and which views those are.
+
+    Attributes:
+        points: ``(*B, N, 3)`` in the world, metres; (0, 0, 0) with zero gradient if not valid.
+        depth: ``(*B, V, N)`` metres, also in views that are outliers; 0 if not valid.
+        status: ``(*B, N)`` int8 of :class:`Status`.
+        valid: ``(*B, N)`` bool, status is OK.
+        residual: ``(*B, N)`` weighted RMS distance, px.
+        parallax: ``(*B, N)`` largest angle, rad.
+        covariance: ``(*B, N, 3, 3)`` m^2; None unless asked for.
+        inliers: ``(*B, V, N)`` bool, the views used; none if not valid.
+    """
+
+    points: Tensor
+    depth: Tensor
+    status: Tensor
+    valid: Tensor
+    residual: Tensor
+    parallax: Tensor
+    covariance: Tensor | None
+    inliers: Tensor
+
+
+def triangulate_robust(
+    proj: Tensor,
+    pixels: Tensor,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    *,
+    threshold: float = 4.0,
+    min_inliers: int = 2,
+    max_pairs: int = 64,
+    covariance: bool = False,
+) -> RobustTriangulation:
+    r"""Find the views that are wrong about each point, and triangulate the others.
+
+    Candidates are the point of all views and that of each pair of views. The best has the
+    smallest cost :math:`\sum_v w_v^2 \min(\|e_v\|^2, t^2)` over the used views, e the distance in
+    pixels and t the threshold; a view behind which the point lies pays in full. The views within
+    the threshold are triangulated; the result is a last candidate.
+
+    Two views confirm each other little: a wrong match near the epipolar line agrees too, and of
+    two that disagree both are rejected. ``min_inliers=3`` asks for a third to confirm. With two
+    camps of equal cost nothing tells which is right, and the order of views decides.
+
+    Args:
+        proj: ``(*B, V, 3, 4)`` K [R | t].
+        pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything.
+        weights: ``(*B, V, N)``, 0 = unused; a sign has no effect. Large ones are rejected last.
+        mask: ``(*B, V, N)`` bool, True = used.
+        threshold: px, the distance beyond which a view is an outlier, whatever its weight. Of
+            noise with standard deviation 1 px in x and y, 4 px rejects one match in 3000, and
+            2 px one in 7.
+        min_inliers: fewest views that must agree, 2 or more.
+        max_pairs: most pairs tried for a point; 64 suffice for all pairs of 11 views. Of more,
+            those half the views apart come first, in a sequence the widest baselines, and each
+            view as often. The order of views then counts.
+        covariance: also compute the covariance of the points.
+
+    Returns:
+        What :func:`triangulate` says of the inliers. Where no candidate has ``min_inliers`` the
+        status is that of all views if it is a failure, else TOO_FEW_VIEWS: too few that agree.
+        Views that are not finite are outliers. Gradients are those of ``triangulate`` with the
+        inliers as its mask: none to outliers. Nothing raises or turns NaN because of values.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+        ValueError: a threshold that is not positive, ``min_inliers`` below 2, no pairs.
+
+    Source: Torr and Zisserman, MLESAC (2000), section 3 (the cost, MSAC); Chum, Matas and
+    Kittler, Locally Optimized RANSAC (2003); Hartley and Zisserman, 2nd ed., section 4.7.
+
+    Example:
+        >>> proj = torch.tensor([[100.0, 0, 50, 0], [0, 100, 40, 0], [0, 0, 1, 0]]).repeat(4, 1, 1)
+        >>> proj[:, 0, 3] = torch.tensor([0.0, -20, -40, -60])  # 20 cm to the right, each
+        >>> pixels = torch.tensor([[60.0, 45], [50, 45], [90, 10], [30, 45]])[:, None]
+        >>> result = triangulate_robust(proj, pixels)
+        >>> result.inliers[:, 0]
+        tensor([ True,  True, False,  True])
+        >>> result.points.round(decimals=3)
+        tensor([[0.2000, 0.1000, 2.0000]])
+    """
+    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
+    check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    if not threshold > 0:
+        raise ValueError(f"threshold must be positive, got {threshold}")
+    if min_inliers < 2:
+        raise ValueError(f"min_inliers must be 2 or more, got {min_inliers}")
+    if max_pairs < 1:
+        raise ValueError(f"max_pairs must be 1 or more, got {max_pairs}")
+
+    with torch.no_grad():
+        observed = _observe(proj, pixels, weights, mask)
+        chunk = max(1, min(8192, _BUDGET // max(1, observed.usable.shape[:-1].numel())))
+        parts = [
+            _consensus(observed.some(start, chunk), threshold, min_inliers, max_pairs)
+            for start in range(0, max(1, pixels.shape[-2]), chunk)
+        ]
+        inliers, reason = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+    found = triangulate(proj, pixels, weights, inliers, covariance=covariance)
+    status = torch.where(inliers.any(dim=-2), found.status, reason)
+    inliers = inliers & found.valid.unsqueeze(-2)
+    return RobustTriangulation(*found._replace(status=status), inliers)
+
+
+class _Observations(NamedTuple):
+    """The inputs in the solver's type, broadcast, with everything unusable replaced.
+
+    Attributes:
+        proj: ``(*B, V, 3, 4)`` finite.
+        pixels: ``(*B, V, N, 2)`` finite.
+        weights: ``(*B, V, N)`` largest 1; 0 where not usable.
+        usable: ``(*B, V, N)`` used, finite, of a weight that counts.
+        finite: ``(*B, N)`` everything used is finite.
+        centers: ``(*B, V, 3)`` of the cameras.
+        directions: ``(*B, 3, V, N)`` of rays of depth 1, in the world; 0 if there is no centre.
+    """
+
+    proj: Tensor
+    pixels: Tensor
+    weights: Tensor
+    usable: Tensor
+    finite: Tensor
+    centers: Tensor
+    directions: Tensor
+
+    def some(self, start: int, count: int) -> "_Observations":
+        """Those of some points."""
+        points = slice(start, start + count)
+        return self._replace(
+            pixels=self.pixels[..., points, :],
+            weights=self.weights[..., points],
+            usable=self.usable[..., points],
+            finite=self.finite[..., points],
+            directions=self.directions[..., points],
+        )
+
+
+def _observe(
+    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> _Observations:
+    work = solver_dtype(proj)
+    weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
+    if mask is not None:
+        weight = torch.where(mask, weight, 0.0)
+    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    weight = weight.to(work).abs().expand(*batch, *weight.shape[-2:])
+    pixels = pixels.to(work).expand(*weight.shape, 2)
+    proj = proj.to(work).expand(*batch, *proj.shape[-3:])
+
+    # What is beyond counts as not finite: products of four overflow. NaN is beyond.
+    limit = torch.finfo(work).max ** 0.25
+    known_camera = (proj.abs() < limit).all(-1).all(-1)
+    known = (pixels.abs() < limit).all(dim=-1) & weight.isfinite() & known_camera[..., None]
+    used = weight != 0  # NaN counts as used
+    usable = used & known
+    largest = torch.where(usable, weight, 0.0).amax(dim=-2, keepdim=True)
+    usable = usable & (weight > NEGLIGIBLE_WEIGHT * largest)  # as in triangulation
+    proj = torch.where(known_camera[..., None, None], proj, 0.0)
+    inverse = torch.linalg.inv_ex(proj[..., :3]).inverse
+    rays = torch.where((inverse.abs() < limit).all(-1).all(-1)[..., None, None], inverse, 0.0)
+    pixels = torch.where(usable[..., None], pixels, 0.0)
+    return _Observations(
+        proj=proj,
+        pixels=pixels,
+        weights=torch.where(usable, weight / torch.where(largest > 0, largest, 1.0), 0.0),
+        usable=usable,
+        finite=(known | ~used).all(dim=-2),
+        centers=-(rays @ proj[..., 3:]).squeeze(-1),
+        directions=(rays @ to_homogeneous(pixels).mT).transpose(-3, -2),
+    )
+
+
+_Best = tuple[Tensor, Tensor]
+"""Inliers ``(*B, V, N)`` of the best candidates, and their cost ``(*B, N)`` px^2, inf if none."""
+
+
+def _consensus(
+    observed: _Observations, threshold: float, min_inliers: int, max_pairs: int
+) -> tuple[Tensor, Tensor]:
+    """Inliers ``(*B, V, N)``, and where there are none the status that says why ``(*B, N)``."""
+
+    def judge(points: Tensor, exist: Tensor) -> _Best:
+        return _judge(observed, points, exist, threshold, min_inliers)
+
+    seen = observed.proj, observed.pixels, observed.weights
+    plain = triangulate(*seen, observed.usable)
+    best = judge(plain.points.mT.unsqueeze(-2), plain.valid.unsqueeze(-2))
+    pairs = _pairs(observed.usable, max_pairs)
+    at_once = max(1, _BUDGET // max(1, observed.usable.numel()))
+    for start in range(0, pairs[0].shape[-2], at_once):
+        some = (tensor[..., start : start + at_once, :] for tensor in pairs)
+        best = _better(best, judge(*_pair_points(observed, *some)))
+    # The better point finds inliers that a pair's noise had hidden; a second time it finds none.
+    again = triangulate_points(*seen, best[0])
+    # Points that failed are 0. One that lies there in truth merely stays as it is.
+    there = (again != 0).any(dim=-1).unsqueeze(-2)
+    inliers, _ = _better(best, judge(again.mT.unsqueeze(-2), there))
+    disagree = torch.where(plain.valid, int(Status.TOO_FEW_VIEWS), plain.status)
+    return inliers, torch.where(observed.finite, disagree, int(Status.NOT_FINITE_INPUT))
+
+
+def _better(one: _Best, other: _Best) -> _Best:
+    """The cheaper of two, the first if they are equal."""
+    cheaper = other[1] < one[1]
+    inliers = torch.where(cheaper.unsqueeze(-2), other[0], one[0])
+    return inliers, torch.where(cheaper, other[1], one[1])
+
+
+def _judge(
+    observed: _Observations, points: Tensor, exist: Tensor, threshold: float, min_inliers: int
+) -> _Best:
+    """The best of the candidates ``(*B, 3, C, N)`` of each point, if any exist ``(*B, C, N)``."""
+    exist = exist & (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(dim=-3)
+    points = torch.where(exist.unsqueeze(-3), points, 0.0)
+    views, shape = observed.usable.shape[-2], points.shape[-2:]
+    proj = observed.proj.flatten(-3, -2)  # (*B, 3 V, 4): one product for all
+    seen = proj[..., :3] @ points.flatten(-2) + proj[..., 3:]
+    x, y, z = seen.reshape(*seen.shape[:-2], views, 3, *shape).unbind(dim=-3)
+    in_front = z > torch.finfo(z.dtype).tiny ** 0.25
+    inverse = 1 / torch.where(in_front, z, 1.0)
+    u, v = observed.pixels.unsqueeze(-3).unbind(dim=-1)
+    distance = (x * inverse - u).square() + (y * inverse - v).square()  # (*B, V, C, N)
+    distance = torch.where(in_front, distance, torch.inf).clamp(max=threshold**2)
+    agree = observed.usable.unsqueeze(-2) & (distance < threshold**2)
+    cost = (observed.weights.square().unsqueeze(-2) * distance).sum(dim=-3)
+    cost = torch.where(exist & (agree.sum(dim=-3) >= min_inliers), cost, torch.inf)
+    cheapest, index = cost.min(dim=-2, keepdim=True)
+    inliers = torch.take_along_dim(agree, index.unsqueeze(-3), dim=-2).squeeze(-2)
+    return inliers & cheapest.isfinite(), cheapest.squeeze(-2)
+
+
+def _pairs(usable: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Pairs of usable views of each point: first, second and whether it exists, ``(*B, C, N)``.
+
+    Views on a circle: pairs half of it apart come first, neighbours last, each pair once.
+    """
+    count = min(most, usable.shape[-2] * (usable.shape[-2] - 1) // 2)
+    order = (~usable).to(torch.int8).argsort(dim=-2, stable=True)  # usable views first
+    around = usable.sum(dim=-2, keepdim=True).clamp(min=1)
+    pair = torch.arange(count, device=usable.device)[:, None]
+    # More views than pairs: start at views all over the circle rather than at the first.
+    first = torch.where(around > count, pair * around // max(1, count), pair % around)
+    apart = (around - 1) // 2 - pair // around
+    # Of an even number of views, the diameters are the half round that is left at the end.
+    apart = torch.where(apart > 0, apart, around // 2)
+    second = (first + apart) % around
+    exist = pair < around * (around - 1) // 2
+    return order.gather(-2, first), order.gather(-2, second), exist
+
+
+def _pair_points(
+    observed: _Observations, first: Tensor, second: Tensor, exist: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points ``(*B, 3, C, N)`` of pairs of views, and whether they exist ``(*B, C, N)``.
+
+    Where the rays are closest to each other, the point between them at which both views are off
+    by about as many pixels.
+    """
+    centers = observed.centers.mT.unsqueeze(-1).expand_as(observed.directions)
+
+    def of(values: Tensor, view: Tensor) -> Tensor:
+        return torch.take_along_dim(values, view.unsqueeze(-3), dim=-2)
+
+    def dot(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum(dim=-3)
+
+    one, other = of(observed.directions, first), of(observed.directions, second)
+    start, end = of(centers, first), of(centers, second)
+    apart = end - start
+    a, b, c = dot(one, one), dot(one, other), dot(other, other)
+    p, q = dot(apart, one), dot(apart, other)
+    crossing = a * c > b * b
+    sine = torch.where(crossing, a * c - b * b, 1.0)
+    near, far = (c * p - b * q) / sine, (b * p - a * q) / sine
+    # An offset at depth z moves the pixel by 1 / z: the nearer view has more to say.
+    share = near.square() / (near.square() + far.square())
+    on_one, on_other = start + near.unsqueeze(-3) * one, end + far.unsqueeze(-3) * other
+    points = on_one + share.unsqueeze(-3) * (on_other - on_one)
+    return points, exist & crossing

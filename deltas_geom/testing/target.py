@@ -1,0 +1,127 @@
+"""What an implementation under test offers."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+ImageSize = tuple[int, int]
+"""(height, width)."""
+DepthRange = tuple[float, float]
+"""(near, far) along the anchor's z axis, metres."""
+
+Segmenter = Callable[[Tensor, Tensor, Tensor, DepthRange, ImageSize], tuple[Tensor, Tensor, Tensor]]
+Sampler = Callable[
+    [Tensor, Tensor, Tensor, DepthRange, ImageSize, int], tuple[Tensor, Tensor, Tensor]
+]
+Drawer = Callable[[Tensor, Tensor, Tensor, ImageSize], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """An implementation under test, in plain tensors, so that wrapping a function takes a line.
+
+    Conventions are ours (docs/conventions.md): pixels are (x, y) with the top-left pixel's centre
+    at (0, 0), an image spans -0.5 ... W - 0.5, ``cam_from_world`` has OpenCV's axes, depth is
+    along z. No batch dims. What is left out is not tested.
+
+    Of two views, view 0 is the anchor and view 1 the source. A *status* is either a mask (True =
+    there is an answer) or integers of :class:`deltas_geom.Status`, which are then also asked to
+    give the right reason.
+
+    Attributes:
+        name: head of its column in the table.
+        project: ``(K (V, 3, 3), cam_from_world (V, 4, 4), points (N, 3)) -> pixels (V, N, 2)``.
+        fundamental: ``(K (2, 3, 3), cam_from_world (2, 4, 4)) -> F (3, 3)`` of any scale and
+            sign, with x1^T F x0 = 0 for pixels x0 of view 0 and x1 of view 1.
+        triangulate: ``(proj (V, 3, 4), pixels (V, N, 2), weights (V, N) or None) -> points
+            (N, 3)`` in the world, metres; ``weights`` multiply the equations, None = all 1.
+        max_views: the most views that ``triangulate``, ``judge`` and ``refine`` take; None = any
+            number.
+        weighted: whether they heed weights; if not, they are called with None.
+        differentiable: whether autograd goes through ``triangulate``.
+        batched: whether ``triangulate`` takes leading batch dims, broadcast against each other.
+        judge: as ``triangulate``, but ``-> status (N)`` of the points.
+        refine: ``(proj (V, 3, 4), pixels (V, N, 2), points (N, 3), weights (V, N) or None) ->
+            points (N, 3)`` with a smaller weighted sum of squared reprojection errors.
+        segments: ``(K (2, 3, 3), cam_from_world (2, 4, 4), pixels (N, 2) of view 0, depth_range,
+            image_size) -> (far (N, 2), near (N, 2), status (N))``: both ends, in view 1, of what
+            is visible there of the depth range. An empty one is False or EMPTY, a single pixel
+            True or NO_PARALLAX; a keypoint that is NaN is False or NOT_FINITE_INPUT.
+        depth_samples: ``(K, cam_from_world, pixels, depth_range, image_size, S) -> (pixels
+            (N, S, 2), inv_depth (N, S), status (N))``: from the far to the near end of each
+            segment, even in inverse depth (of view 0's z, 1/m).
+        pixel_samples: the same, even in pixels.
+        sweep: ``(K, cam_from_world, pixels (N, 2), inv_depth (S), image_size) -> (pixels
+            (N, S, 2), visible (N, S) bool)``: where view 1 sees each inverse depth, 0 included.
+        sample_map: ``(feature_map (D, h, w), pixels (N, 2), image_size) -> (N, D)``: a map that
+            covers the image in coarser cells, read bilinearly.
+        correlate: ``(descriptors (N, D), feature_map (D, h, w), pixels (N, S, 2), image_size) ->
+            scores (N, S)``: dot products with the map at places.
+        soft_argmax: ``(logits (S), positions (S, D), mask (S) bool) -> (D)``: mean position.
+        soft_covariance: as ``soft_argmax``, but ``-> (D, D)``: covariance about that mean.
+        heatmap_argmax: ``(logits (h, w)) -> pixel (2)``: mean pixel under the softmax.
+        rasterize: ``(pixels (N, 2), depth (N), image_size) -> depth (H, W)``: each point goes to
+            the nearest pixel, where the nearest point wins; 0 = no point.
+        mean_depth: ``(pixels (N, 2), depth (N), weights (N), image_size) -> (depth (H, W),
+            weight (H, W))``: weighted mean and summed weight of each pixel's points.
+        splat: the same, each point shared among its four neighbours bilinearly.
+
+    Example:
+        >>> from deltas_geom.triangulation import triangulate_points
+        >>> mine = Target("mine", triangulate=triangulate_points, max_views=2, weighted=False)
+        >>> mine.offers("weights"), mine.offers("project")
+        (False, False)
+    """
+
+    name: str
+    project: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
+    fundamental: Callable[[Tensor, Tensor], Tensor] | None = None
+    triangulate: Callable[[Tensor, Tensor, Tensor | None], Tensor] | None = None
+    max_views: int | None = None
+    weighted: bool = True
+    differentiable: bool = True
+    batched: bool = False
+    judge: Callable[[Tensor, Tensor, Tensor | None], Tensor] | None = None
+    refine: Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor] | None = None
+    segments: Segmenter | None = None
+    depth_samples: Sampler | None = None
+    pixel_samples: Sampler | None = None
+    sweep: Callable[[Tensor, Tensor, Tensor, Tensor, ImageSize], tuple[Tensor, Tensor]] | None = (
+        None
+    )
+    sample_map: Callable[[Tensor, Tensor, ImageSize], Tensor] | None = None
+    correlate: Callable[[Tensor, Tensor, Tensor, ImageSize], Tensor] | None = None
+    soft_argmax: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
+    soft_covariance: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
+    heatmap_argmax: Callable[[Tensor], Tensor] | None = None
+    rasterize: Callable[[Tensor, Tensor, ImageSize], Tensor] | None = None
+    mean_depth: Drawer | None = None
+    splat: Drawer | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_views is not None and self.max_views < 2:
+            raise ValueError(f"max_views must be 2 or more, or None, got {self.max_views}")
+
+    def offers(self, feature: str) -> bool:
+        """Whether there is something to test.
+
+        Args:
+            feature: the name of a function above, or of what goes with some of them: "weights"
+                and "many views" (three and more) of triangulation, status and refinement,
+                "gradients" and "batches" of triangulation, "samples" (of either spacing),
+                "drawing" (of depth, in any of three ways).
+        """
+        solves = any((self.triangulate, self.judge, self.refine))
+        more = {
+            "weights": solves and self.weighted,
+            "gradients": self.triangulate is not None and self.differentiable,
+            "batches": self.triangulate is not None and self.batched,
+            "many views": solves and (self.max_views is None or self.max_views >= 3),
+            "samples": self.depth_samples is not None or self.pixel_samples is not None,
+            "drawing": any((self.rasterize, self.mean_depth, self.splat)),
+        }
+        if feature in more:
+            return more[feature]
+        function: object = getattr(self, feature)
+        return function is not None

@@ -1,0 +1,334 @@
+"""Correlation first, sampling second: the same answers as the other way round."""
+
+import shutil
+from collections.abc import Callable
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import Samples, ShapeError, correlate, correlate_normalized, sample_map
+from deltas_geom.testing.strategies import image_pixels, vectors
+
+SIZE = (24, 32)  # of the image, px; the map has stride 4
+Correlation = Callable[..., Tensor]
+BOTH = pytest.mark.parametrize("function", [correlate, correlate_normalized])
+
+
+def samples_at(pixels: Tensor, mask: Tensor | None = None) -> Samples:
+    """Samples ``(*B, V, N, O=1, S)`` at pixels ``(*B, V, N, S, 2)``."""
+    places = pixels.unsqueeze(-3)
+    every = torch.ones(places.shape[:-1], dtype=torch.bool)
+    return Samples(places, places.select(-3, 0)[..., 0], every if mask is None else mask)
+
+
+def sampled(
+    descriptors: Tensor, feature_map: Tensor, pixels: Tensor, *, normalized: bool = False
+) -> Tensor:
+    """The same by reading all channels: ``(V, N, 1, S)`` of pixels ``(V, N, S, 2)``."""
+    read = sample_map(feature_map, pixels.flatten(1, 2), image_size=SIZE)
+    read = F.normalize(read, dim=-1, eps=1e-30) if normalized else read
+    read = read.unflatten(1, pixels.shape[1:3])
+    return (descriptors[:, None] * read).sum(dim=-1).unsqueeze(-2)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> tuple[Tensor, Tensor, Tensor]:
+    """Descriptors ``(5, 3)``, a map ``(1, 3, 6, 8)`` of lengths over 1, pixels ``(1, 5, 2, 2)``."""
+    features = draw(vectors(48, within=1.0)).mT.reshape(1, 3, 6, 8)
+    features[:, 0] += 2  # so that no two neighbours cancel
+    pixels = draw(image_pixels(10, image_size=SIZE)).reshape(1, 5, 2, 2)
+    return draw(vectors(5, within=1.0)), features, pixels
+
+
+def random_scene(
+    dtype: torch.dtype = torch.float64, *, count: int = 3, size: tuple[int, int] = (4, 5)
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Two sources, two samples a keypoint, some of them beyond the border."""
+    generator = torch.Generator().manual_seed(0)
+    descriptors = torch.randn(count, 3, generator=generator, dtype=dtype)
+    features = torch.randn(2, 3, *size, generator=generator, dtype=dtype)
+    pixels = torch.rand(2, count, 2, 2, generator=generator, dtype=dtype)
+    extent = torch.tensor([SIZE[1], SIZE[0]], dtype=dtype)
+    return descriptors, features, (1.2 * pixels - 0.1) * extent
+
+
+@BOTH
+def test_wrong_arguments_are_named(function: Correlation) -> None:
+    samples = samples_at(torch.zeros(1, 5, 1, 2))
+    with pytest.raises(ShapeError, match="descriptors"):
+        function(torch.zeros(3), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
+    with pytest.raises(ShapeError, match="feature_map has D = 3 but descriptors has D = 2"):
+        function(torch.zeros(5, 2), torch.zeros(1, 3, 4, 4), samples, image_size=(4, 4))
+
+
+@BOTH
+def test_batch_dims_broadcast(function: Correlation, dtype: torch.dtype) -> None:
+    descriptors = torch.rand(2, 3, 6, dtype=dtype)
+    features = torch.rand(4, 1, 2, 6, 6, 8, dtype=dtype)
+    pixels = 32 * torch.rand(2, 3, 7, 2, dtype=dtype)
+    scores = function(descriptors, features, samples_at(pixels), image_size=SIZE)
+    assert scores.shape == (4, 2, 2, 3, 1, 7) and scores.dtype == dtype
+    alone = function(descriptors[1], features[3, 0], samples_at(pixels), image_size=SIZE)
+    assert_close(scores[3, 1], alone)
+
+
+@BOTH
+def test_nothing_to_correlate_is_no_error(function: Correlation) -> None:
+    for batch, views, count in ((2, 1, 0), (0, 1, 3), (2, 0, 3)):
+        descriptors = torch.zeros(batch, count, 3, requires_grad=True)
+        samples = samples_at(torch.zeros(batch, views, count, 5, 2))
+        features = torch.zeros(batch, views, 3, 4, 4, requires_grad=True)
+        scores = function(descriptors, features, samples, image_size=(4, 4))
+        assert scores.shape == (batch, views, count, 1, 5)
+        gradients = torch.autograd.grad(scores.sum(), (descriptors, features), allow_unused=True)
+        assert all(gradient is None or (gradient == 0).all() for gradient in gradients)
+
+
+@given(scene=scenes())
+def test_correlating_then_sampling_is_sampling_then_correlating(
+    scene: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    descriptors, features, pixels = scene
+    scores = correlate(descriptors, features, samples_at(pixels), image_size=SIZE)
+    assert_close(scores, sampled(descriptors, features, pixels), rtol=0, atol=1e-12)
+
+
+@given(scene=scenes())
+def test_lengths_are_those_of_the_sampled_features(scene: tuple[Tensor, Tensor, Tensor]) -> None:
+    for dtype, atol in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
+        descriptors, features, pixels = (part.to(dtype) for part in scene)
+        scores = correlate_normalized(descriptors, features, samples_at(pixels), image_size=SIZE)
+        wanted = sampled(descriptors, features, pixels, normalized=True)
+        assert_close(scores, wanted, rtol=0, atol=atol)
+
+
+@given(scene=scenes(), other=scenes(), factor=st.floats(-10, 10))
+def test_correlation_is_linear_in_both_factors(
+    scene: tuple[Tensor, Tensor, Tensor], other: tuple[Tensor, Tensor, Tensor], factor: float
+) -> None:
+    (first, features, pixels), (second, more, _) = scene, other
+    samples = samples_at(pixels)
+    for function in (correlate, correlate_normalized):
+        both = function(first + factor * second, features, samples, image_size=SIZE)
+        one = function(first, features, samples, image_size=SIZE)
+        two = function(second, features, samples, image_size=SIZE)
+        assert_close(both, one + factor * two, rtol=0, atol=1e-11)
+    both = correlate(first, features + factor * more, samples, image_size=SIZE)
+    one = correlate(first, features, samples, image_size=SIZE)
+    two = correlate(first, more, samples, image_size=SIZE)
+    assert_close(both, one + factor * two, rtol=0, atol=1e-11)
+
+
+@given(scene=scenes(), scale=st.floats(1e-3, 1e3))
+def test_a_normalized_score_is_a_cosine(scene: tuple[Tensor, Tensor, Tensor], scale: float) -> None:
+    descriptors, features, pixels = scene
+    unit = F.normalize(descriptors, dim=-1)
+    scores = correlate_normalized(unit, features, samples_at(pixels), image_size=SIZE)
+    assert (scores.abs() <= 1 + 1e-12).all()
+    scaled = correlate_normalized(unit, scale * features, samples_at(pixels), image_size=SIZE)
+    assert_close(scaled, scores, rtol=0, atol=1e-12)
+
+
+@given(scene=scenes(), steps=st.tuples(st.integers(-2, 2), st.integers(-2, 2)))
+def test_a_map_and_its_samples_shift_together(
+    scene: tuple[Tensor, Tensor, Tensor], steps: tuple[int, int]
+) -> None:
+    descriptors, features, pixels = scene
+    # The outer two centres of each side roll over to the other side.
+    inner = torch.tensor([9.5, 9.5]) + (pixels + 0.5) / torch.tensor([32, 24]) * torch.tensor(
+        [12, 4]
+    )
+    moved = inner + 4 * torch.tensor(steps)
+    rolled = features.roll(steps, dims=(-1, -2))
+    for function in (correlate, correlate_normalized):
+        scores = function(descriptors, features, samples_at(inner), image_size=SIZE)
+        shifted = function(descriptors, rolled, samples_at(moved), image_size=SIZE)
+        assert_close(shifted, scores, rtol=0, atol=1e-12)
+
+
+@BOTH
+@given(scene=scenes(), drawn=vectors(5, within=1.0, size=2))
+def test_what_is_masked_may_lie_anywhere(
+    function: Correlation, scene: tuple[Tensor, Tensor, Tensor], drawn: Tensor
+) -> None:
+    descriptors, features, pixels = scene
+    mask = (drawn > 0)[None, :, None]
+    leaves = [descriptors.requires_grad_(), features.requires_grad_(), pixels.requires_grad_()]
+    results = []
+    for elsewhere in (0.0, torch.nan, torch.inf):
+        places = torch.where(mask.squeeze(-2)[..., None], pixels, elsewhere)
+        scores = function(descriptors, features, samples_at(places, mask), image_size=SIZE)
+        results.append((scores, *torch.autograd.grad(scores.sum(), leaves)))
+        assert (scores[~mask] == 0).all()
+        assert (results[-1][3][~mask.squeeze(-2)] == 0).all()
+        for found, wanted in zip(results[-1], results[0], strict=True):
+            assert_close(found, wanted, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_gradients_are_those_of_sampling_all_channels(dtype: torch.dtype, normalized: bool) -> None:
+    leaves = [part.requires_grad_() for part in random_scene(dtype, count=300, size=(6, 8))]
+    function = correlate_normalized if normalized else correlate
+    ours = function(*leaves[:2], samples_at(leaves[2]), image_size=SIZE)
+    wanted = sampled(*leaves, normalized=normalized)
+    weights = torch.linspace(-1, 1, ours.numel(), dtype=dtype).reshape(ours.shape)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    assert_close(ours, wanted, rtol=tolerance, atol=tolerance)
+    for found, expected in zip(
+        torch.autograd.grad((weights * ours).sum(), leaves),
+        torch.autograd.grad((weights * wanted).sum(), leaves),
+        strict=True,
+    ):
+        # Relative to the largest: where neighbours nearly cancel, both lose digits.
+        assert (found - expected).abs().max() <= 100 * tolerance * expected.abs().max()
+
+
+@BOTH
+def test_many_keypoints_correlate_as_few_do(function: Correlation) -> None:
+    descriptors, features, pixels = random_scene(torch.float32, count=300, size=(120, 160))
+    together = function(descriptors, features, samples_at(pixels), image_size=SIZE)
+    for some in (slice(0, 7), slice(40, 200)):
+        alone = function(descriptors[some], features, samples_at(pixels[:, some]), image_size=SIZE)
+        assert_close(together[:, some], alone, rtol=1e-5, atol=1e-5)
+
+
+@BOTH
+def test_first_and_second_derivatives_are_right(function: Correlation) -> None:
+    mask = torch.rand(2, 3, 1, 2, generator=torch.Generator().manual_seed(1)) < 0.8
+
+    def score(descriptors: Tensor, features: Tensor, pixels: Tensor) -> Tensor:
+        return function(descriptors, features, samples_at(pixels, mask), image_size=SIZE)
+
+    leaves = tuple(part.requires_grad_() for part in random_scene())
+    fixed = (*leaves[:2], leaves[2].detach())
+    for inputs in (leaves, fixed):
+        assert torch.autograd.gradcheck(score, inputs)
+        assert torch.autograd.gradgradcheck(score, inputs)
+
+
+@BOTH
+def test_backward_keeps_only_the_inputs(function: Correlation) -> None:
+    descriptors, features, pixels = random_scene(torch.float32, count=200, size=(60, 80))
+    samples = samples_at(pixels)
+    leaves = [descriptors.requires_grad_(), features.requires_grad_()]
+    kept: dict[int, int] = {}
+
+    def count(tensor: Tensor) -> Tensor:
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+        scores = function(descriptors, features, samples, image_size=SIZE)
+    for tensor in (*leaves, pixels, samples.mask):
+        kept.pop(tensor.untyped_storage().data_ptr(), None)
+    # Beside them the normalised scores keep both factors, and nine numbers a pixel of the map.
+    table = 9 * features[:, 0].numel() * 4
+    extra = 0 if function is correlate else 2 * scores.numel() * 4 + table
+    assert sum(kept.values()) <= extra
+
+
+@BOTH
+def test_vmap_and_jacrev_agree_with_plain_calls(function: Correlation) -> None:
+    descriptors, features, pixels = random_scene()
+
+    def score(descriptors: Tensor, features: Tensor, pixels: Tensor) -> Tensor:
+        return function(descriptors, features, samples_at(pixels[None]), image_size=SIZE)
+
+    # Keypoints shared, a map and pixels for each of two.
+    mapped = torch.func.vmap(score, in_dims=(None, 0, 0))(descriptors, features[:, None], pixels)
+    plain = function(descriptors, features, samples_at(pixels), image_size=SIZE)
+    assert_close(mapped.squeeze(1), plain, rtol=0, atol=1e-12)
+    inputs = (descriptors, features[:1], pixels[0])
+    wanted = torch.autograd.functional.jacobian(score, inputs)
+    for found, expected in zip(
+        torch.func.jacrev(score, argnums=(0, 1, 2))(*inputs), wanted, strict=True
+    ):
+        assert_close(found, expected, rtol=0, atol=1e-10)
+    per_map = torch.func.vmap(torch.func.jacrev(score, argnums=2), in_dims=(None, 0, 0))
+    found = per_map(descriptors, features[:, None], pixels)[0]
+    assert_close(found, wanted[2], rtol=0, atol=1e-10)
+
+    # The other nesting: an inner vmap hides from the outer derivative what it is taken of.
+    def mapped_score(pixels: Tensor) -> Tensor:
+        return torch.func.vmap(score, in_dims=(None, 0, 0))(descriptors, features[:, None], pixels)
+
+    found = torch.func.jacrev(mapped_score)(pixels)
+    assert_close(found[0, ..., 0, :, :, :], wanted[2], rtol=0, atol=1e-10)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler")
+def test_both_compile_without_a_graph_break() -> None:
+    *leaves, pixels = random_scene()
+    leaves = [leaf.requires_grad_() for leaf in leaves]
+
+    def score(descriptors: Tensor, features: Tensor) -> Tensor:
+        pair = (
+            function(descriptors, features, samples_at(pixels), image_size=SIZE)
+            for function in (correlate, correlate_normalized)
+        )
+        return sum(scores.square().sum() for scores in pair)
+
+    found = torch.autograd.grad(torch.compile(score, fullgraph=True)(*leaves), leaves)
+    for ours, wanted in zip(found, torch.autograd.grad(score(*leaves), leaves), strict=True):
+        assert_close(ours, wanted, rtol=1e-9, atol=1e-9)
+
+
+@BOTH
+def test_it_exports_for_any_number_of_keypoints(function: Correlation) -> None:
+    class Score(torch.nn.Module):
+        def forward(self, descriptors: Tensor, features: Tensor, pixels: Tensor) -> Tensor:
+            return function(descriptors, features, samples_at(pixels), image_size=SIZE)
+
+    keypoints = torch.export.Dim("keypoints", min=2, max=4096)
+    exported = torch.export.export(
+        Score(), random_scene(count=3), dynamic_shapes=({0: keypoints}, None, {1: keypoints})
+    )
+    scene = random_scene(count=7)
+    assert_close(exported.module()(*scene), Score()(*scene))
+
+
+@BOTH
+def test_half_precision_around_it_does_not_move_the_samples(function: Correlation) -> None:
+    descriptors, features, pixels = random_scene(torch.float32, size=(60, 80))
+    leaves = [descriptors.requires_grad_(), features.requires_grad_()]
+    plain = function(*leaves, samples_at(pixels), image_size=SIZE)
+    wanted = torch.autograd.grad(plain.square().sum(), leaves)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = function(*leaves, samples_at(pixels), image_size=SIZE)
+        found = torch.autograd.grad(mixed.square().sum(), leaves)
+    for ours, expected in zip((mixed, *found), (plain, *wanted), strict=True):
+        assert_close(ours, expected, rtol=0, atol=0)
+    # Half-precision features are read at full-precision places, with full-precision arithmetic.
+    halves = [leaf.detach().bfloat16().requires_grad_() for leaf in leaves]
+    read = function(*halves, samples_at(pixels), image_size=SIZE)
+    full = function(*(half.float() for half in halves), samples_at(pixels), image_size=SIZE)
+    assert read.dtype == torch.float32
+    assert_close(read, full, rtol=0, atol=0)
+    assert all(g.dtype == torch.bfloat16 for g in torch.autograd.grad(read.sum(), halves))
+
+
+def test_features_that_cancel_have_no_direction(dtype: torch.dtype) -> None:
+    one = torch.tensor([0.6, -0.3, 1.7], dtype=dtype)
+    row = torch.stack([one, -one, torch.zeros_like(one)], dim=-1).reshape(1, 3, 1, 3)
+    features = row.requires_grad_()
+    places = torch.tensor([[0.5, 0.0], [2.0, 0.0], [0.0, 0.0]], dtype=dtype).requires_grad_()
+    descriptors = one[None].clone().requires_grad_()
+    scores = correlate_normalized(
+        descriptors, features, samples_at(places[None, None]), image_size=(1, 3)
+    )
+    assert_close(scores[0, 0, 0], torch.stack([one[0] * 0, one[0] * 0, one.norm()]))
+    for gradient in torch.autograd.grad(scores[..., :2].sum(), (descriptors, features, places)):
+        assert (gradient == 0).all()
+
+
+@BOTH
+def test_a_map_of_one_pixel_is_everywhere_the_same(function: Correlation) -> None:
+    descriptors, features, pixels = random_scene(size=(1, 1))
+    scores = function(descriptors, features, samples_at(pixels), image_size=SIZE)
+    wanted = sampled(descriptors, features, pixels, normalized=function is correlate_normalized)
+    assert_close(scores, wanted, rtol=0, atol=1e-12)

@@ -1,0 +1,383 @@
+"""Which views are wrong about a point: by construction, and where nothing can tell."""
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import (
+    PosedViews,
+    RobustTriangulation,
+    ShapeError,
+    Status,
+    triangulate,
+    triangulate_robust,
+)
+from deltas_geom.testing import DEGENERATE_SCENES, PosedScene, forward_motion, ring, scene_from
+from deltas_geom.testing.strategies import extreme, posed_scenes, vectors
+
+NOISE = 0.5  # px, so that all views are within the default threshold of 4 px
+
+
+@st.composite
+def noisy(draw: st.DrawFn, num_views: int = 5) -> tuple[PosedScene, Tensor]:
+    """A scene of four points whose pixels are off by up to NOISE, and weights of 0.5 to 1."""
+    scene = draw(posed_scenes(num_views=num_views))
+    noise = draw(vectors(num_views * 4, within=NOISE, size=2)).reshape(num_views, 4, 2)
+    weights = 0.75 + draw(vectors(num_views, within=0.25, size=4))
+    return scene._replace(pixels=scene.pixels + noise), weights
+
+
+@st.composite
+def spoiled(draw: st.DrawFn, num_views: int = 5) -> tuple[PosedScene, Tensor, Tensor]:
+    """The same, and one view of each point 50 px or more from where it belongs: the outliers.
+
+    Across the rows, which the cameras side by side have for epipolar lines within 0.7 rad: no
+    other view can agree.
+    """
+    scene, weights = draw(noisy(num_views))
+    wrong = torch.tensor(draw(st.lists(st.integers(0, num_views - 1), min_size=4, max_size=4)))
+    outliers = torch.arange(num_views)[:, None] == wrong
+    up = 2.0 * torch.tensor(draw(st.lists(st.booleans(), min_size=4, max_size=4))) - 1
+    offset = torch.stack([draw(vectors(1, within=20.0, size=4))[0], 50 + 0 * up], dim=-1)
+    moved = scene.pixels + offset * up[:, None]
+    return (
+        scene._replace(pixels=torch.where(outliers[..., None], moved, scene.pixels)),
+        weights,
+        outliers,
+    )
+
+
+def assert_same(found: RobustTriangulation, wanted: Any, *, atol: float = 1e-9) -> None:
+    """All that both tell of the points, m and px."""
+    assert torch.equal(found.status, wanted.status) and torch.equal(found.valid, wanted.valid)
+    for name in ("points", "residual", "parallax"):
+        assert_close(getattr(found, name), getattr(wanted, name), rtol=0, atol=atol)
+
+
+def test_wrong_arguments_are_named() -> None:
+    proj, pixels = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2)
+    with pytest.raises(ShapeError, match="pixels has V = 3 but proj has V = 2"):
+        triangulate_robust(proj, torch.zeros(3, 5, 2))
+    with pytest.raises(ShapeError, match="mask"):
+        triangulate_robust(proj, pixels, mask=torch.ones(1, 5, dtype=torch.bool))
+    with pytest.raises(ValueError, match="threshold must be positive, got 0"):
+        triangulate_robust(proj, pixels, threshold=0)
+    with pytest.raises(ValueError, match="min_inliers must be 2 or more, got 1"):
+        triangulate_robust(proj, pixels, min_inliers=1)
+    with pytest.raises(ValueError, match="max_pairs must be 1 or more, got 0"):
+        triangulate_robust(proj, pixels, max_pairs=0)
+
+
+def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
+    scene = ring(dtype=dtype)
+    pixels = scene.pixels.repeat(4, 1, 1, 3, 1)
+    pixels[1, :, 2, 0] += 40  # px
+    result = triangulate_robust(
+        scene.views.proj.expand(6, 1, 4, 3, 4),
+        pixels[:, None],
+        torch.ones(5, 4, 3, dtype=dtype),
+        covariance=True,
+    )
+    assert result.points.shape == (4, 6, 5, 3, 3) and result.points.dtype == dtype
+    assert result.inliers.shape == result.depth.shape == (4, 6, 5, 4, 3)
+    assert result.status.shape == (4, 6, 5, 3) and result.valid.all()
+    assert result.covariance is not None and result.covariance.shape == (4, 6, 5, 3, 3, 3)
+    wanted = torch.ones(4, 6, 5, 4, 3, dtype=torch.bool)
+    wanted[1, ..., 2, 0] = False
+    assert torch.equal(result.inliers, wanted)
+
+
+def test_no_points_and_a_single_view_are_no_error() -> None:
+    proj = forward_motion().views.proj
+    nothing = triangulate_robust(proj, torch.zeros(2, 0, 2).double())
+    assert nothing.points.shape == (0, 3) and nothing.inliers.shape == (2, 0)
+    alone = triangulate_robust(proj[:1], torch.zeros(1, 4, 2).double())
+    assert (alone.status == Status.TOO_FEW_VIEWS).all() and not alone.inliers.any()
+
+
+@pytest.mark.parametrize("num_views", [2, 3, 5])
+@given(data=st.data())
+def test_without_outliers_it_is_triangulation(num_views: int, data: st.DataObject) -> None:
+    scene, weights = data.draw(noisy(num_views))
+    found = triangulate_robust(scene.views.proj, scene.pixels, weights, covariance=True)
+    wanted = triangulate(scene.views.proj, scene.pixels, weights, covariance=True)
+    assert found.inliers.all()
+    for ours, plain in zip(found, wanted, strict=False):
+        assert torch.equal(ours, plain)
+
+
+@pytest.mark.parametrize("num_views", [4, 5, 8])
+@given(data=st.data())
+def test_one_gross_outlier_is_found(num_views: int, data: st.DataObject) -> None:
+    scene, weights, outliers = data.draw(spoiled(num_views))
+    found = triangulate_robust(scene.views.proj, scene.pixels, weights)
+    assert torch.equal(found.inliers, ~outliers)
+    assert_same(found, triangulate(scene.views.proj, scene.pixels, weights, ~outliers), atol=0)
+
+
+@given(drawn=spoiled(), order=st.permutations(range(5)))
+def test_the_order_of_views_does_not_count(
+    drawn: tuple[PosedScene, Tensor, Tensor], order: list[int]
+) -> None:
+    scene, weights, _ = drawn
+    one = triangulate_robust(scene.views.proj, scene.pixels, weights)
+    other = triangulate_robust(scene.views.proj[order], scene.pixels[order], weights[order])
+    assert torch.equal(other.inliers, one.inliers[order])
+    assert_same(other, one)
+
+
+@given(drawn=spoiled(6), view=st.integers(0, 5), by_mask=st.booleans(), spoil=st.booleans())
+def test_a_view_that_is_masked_or_of_weight_0_is_a_view_removed(
+    drawn: tuple[PosedScene, Tensor, Tensor], view: int, by_mask: bool, spoil: bool
+) -> None:
+    scene, weights, _ = drawn
+    rest = [other for other in range(6) if other != view]
+    proj, pixels = scene.views.proj.clone(), scene.pixels.clone()
+    wanted = triangulate_robust(proj[rest], pixels[rest], weights[rest])
+    pixels[view] = torch.nan
+    if spoil:
+        proj[view] = torch.nan
+    there = (torch.arange(6) != view)[:, None].expand(6, 4)
+    if by_mask:
+        found = triangulate_robust(proj, pixels, weights, there)
+    else:
+        found = triangulate_robust(proj, pixels, weights * there)
+    assert not found.inliers[view].any() and torch.equal(found.inliers[rest], wanted.inliers)
+    assert_same(found, wanted)
+
+
+@given(drawn=spoiled(), view=st.integers(0, 4), value=st.sampled_from([torch.nan, torch.inf]))
+def test_a_view_that_is_not_finite_is_an_outlier(
+    drawn: tuple[PosedScene, Tensor, Tensor], view: int, value: float
+) -> None:
+    scene, weights, _ = drawn
+    there = (torch.arange(5) != view)[:, None].expand(5, 4)
+    wanted = triangulate_robust(scene.views.proj, scene.pixels, weights, there)
+    for spoilt in range(3):
+        inputs = [tensor.clone() for tensor in (scene.views.proj, scene.pixels, weights)]
+        inputs[spoilt][view] = value
+        found = triangulate_robust(*inputs)
+        assert torch.equal(found.inliers, wanted.inliers)
+        assert_same(found, wanted)
+
+
+def test_what_fails_says_why() -> None:
+    scene = ring()
+    pixels = scene.pixels.repeat(1, 6, 1)
+    mask = torch.ones(4, 6, dtype=torch.bool)
+    pixels[1:, 1:4] += torch.tensor([[0, 90], [0, -90], [50, 200]])[:, None]  # px: none agree
+    mask[1:, 2] = False  # a view alone
+    pixels[1, 3] = torch.nan
+    mask[2:, 4] = False
+    pixels[1, 4, 1] += 60  # two that disagree
+    mask[3, 5] = False
+    pixels[0, 5] = torch.inf
+    result = triangulate_robust(scene.views.proj, pixels, mask=mask)
+    few, unknown = Status.TOO_FEW_VIEWS, Status.NOT_FINITE_INPUT
+    assert result.status.tolist() == [Status.OK, few, few, unknown, few, Status.OK]
+    assert torch.equal(result.valid, result.status == Status.OK)
+    assert torch.equal(result.inliers.any(dim=0), result.valid)
+    for value in (result.points.mT, result.depth, result.residual, result.parallax):
+        assert (value[..., ~result.valid] == 0).all()
+
+
+@pytest.mark.parametrize("name", DEGENERATE_SCENES)
+def test_named_scenes_have_the_status_of_triangulation(name: str, dtype: torch.dtype) -> None:
+    scene = DEGENERATE_SCENES[name](dtype=dtype)
+    found = triangulate_robust(scene.views.proj, scene.pixels)
+    assert_same(found, triangulate(scene.views.proj, scene.pixels), atol=0)
+    assert torch.equal(found.inliers.all(dim=0), found.valid)
+
+
+def test_a_third_view_must_confirm_where_asked(dtype: torch.dtype) -> None:
+    scene = ring(dtype=dtype)
+    pixels = scene.pixels.clone()
+    pixels[2:] += torch.tensor([[[0, 90]], [[0, -90]]])  # px
+    two = triangulate_robust(scene.views.proj, pixels)
+    assert two.inliers[:, 0].tolist() == [True, True, False, False]
+    three = triangulate_robust(scene.views.proj, pixels, min_inliers=3)
+    assert three.status.item() == Status.TOO_FEW_VIEWS and not three.inliers.any()
+
+
+def test_a_pair_without_parallax_has_no_say() -> None:
+    # Views 0 and 1 share a place and a wrong match: they agree at every depth, and on none.
+    scene = ring()
+    proj, pixels = scene.views.proj[[0, 0, 1, 2, 3]], scene.pixels[[0, 0, 1, 2, 3]]
+    pixels[:2] += 40  # px
+    found = triangulate_robust(proj, pixels)
+    assert found.inliers[:, 0].tolist() == [False, False, True, True, True]
+
+
+def test_a_view_behind_which_a_point_lies_does_not_agree() -> None:
+    scene, _ = in_a_row(4, 5)
+    pose = scene.views.cam_from_world.clone()
+    # The last camera turns its back; its pixels are those of the rays through its centre.
+    pose[3] = torch.diag(torch.tensor([-1.0, 1, -1, 1])).double() @ pose[3]
+    proj, pixels = PosedViews(scene.views.K, pose).proj, scene.pixels.clone()
+    seen = scene.points @ proj[3, :, :3].mT + proj[3, :, 3]
+    pixels[3] = seen[:, :2] / seen[:, 2:]
+    found = triangulate_robust(proj, pixels)
+    assert found.valid.all() and found.inliers.sum(dim=1).tolist() == [5, 5, 5, 0]
+
+
+def test_an_unused_view_agrees_with_nothing() -> None:
+    views = ring().views.crop(left=320, top=240)  # the point is seen at (0, 0)
+    mask = torch.tensor([True, True, False, True])[:, None]
+    pixels = torch.zeros(4, 1, 2).double()
+    found = triangulate_robust(views.proj, pixels, mask=mask)
+    assert torch.equal(found.inliers, mask)
+    # A weight that does not count in triangulation does not count here.
+    weights = torch.where(mask, 1.0, 1e-9).double()
+    assert torch.equal(triangulate_robust(views.proj, pixels, weights).inliers, mask)
+
+
+@pytest.mark.parametrize("size", [1e60, 1e75, 1e100, 1e300, 1.5e308])
+def test_a_wild_view_spoils_no_other(size: float) -> None:
+    scene = ring()
+    wanted = [True, True, True, False]
+    for wild in range(3):
+        proj, pixels = scene.views.proj.clone(), scene.pixels.clone()
+        if wild == 0:
+            pixels[3] = size
+        elif wild == 1:
+            proj[3] = size * torch.linspace(-1, 1, 12).reshape(3, 4)
+        else:
+            proj[3, :, 3] = size * torch.tensor([1.0, 0.5, 1])
+        inputs = proj.requires_grad_(), pixels.requires_grad_()
+        found = triangulate_robust(*inputs)
+        assert found.inliers[:, 0].tolist() == wanted
+        assert all(value is None or value.isfinite().all() for value in found)
+        gradients = torch.autograd.grad(found.points.sum() + found.residual.sum(), inputs)
+        assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+@given(drawn=noisy(2), off=st.floats(10, 30))
+def test_a_threshold_is_a_distance_in_pixels(drawn: tuple[PosedScene, Tensor], off: float) -> None:
+    scene, _ = drawn
+    scene.pixels[1, :, 1] += off
+    best = triangulate(scene.views.proj, scene.pixels)
+    distance = (scene_from(scene.views, best.points).pixels - scene.pixels).norm(dim=-1).amax(dim=0)
+    assert (distance > 2).all()  # px: epipolar lines within 0.7 rad of the rows
+    for point in range(4):
+        some = scene.pixels[:, point : point + 1]
+        for factor in (0.5, 1.001):
+            found = triangulate_robust(
+                scene.views.proj, some, threshold=factor * float(distance[point])
+            )
+            assert found.valid.item() == (factor > 1)
+
+
+def test_a_heavy_view_is_rejected_last() -> None:
+    scene = ring()
+    pixels = scene.pixels.clone()
+    pixels[2:] = scene_from(scene.views, scene.points + 0.3).pixels[2:]  # two against two
+    for heavy in ([0, 1], [2, 3]):
+        weights = torch.ones(4, 1).double()
+        weights[heavy] = 1.5
+        found = triangulate_robust(scene.views.proj, pixels, weights)
+        assert found.inliers[:, 0].nonzero().flatten().tolist() == heavy
+
+
+def in_a_row(num_views: int, num_points: int) -> tuple[PosedScene, Tensor]:
+    """A row of cameras 2 m long, and pixels of which no two agree in any two of its views."""
+    pose = torch.eye(4).double().repeat(num_views, 1, 1)
+    pose[:, 0, 3] = -torch.linspace(-1, 1, num_views).double()
+    views = PosedViews(ring().views.K[:1].expand(num_views, 3, 3), pose)
+    points = torch.linspace(-0.5, 0.5, num_points).double()[:, None] * torch.tensor([1, 0.5, 0.5])
+    scene = scene_from(views, points + torch.tensor([0, 0, 4]))
+    wrong = scene.pixels.clone()
+    wrong[..., 1] += 40 + 20 * torch.arange(num_views)[:, None]
+    return scene, wrong
+
+
+@pytest.mark.parametrize("num_views", [4, 5, 10, 11])
+def test_of_eleven_views_any_two_that_agree_are_found(num_views: int) -> None:
+    pairs = torch.combinations(torch.arange(num_views))
+    scene, wrong = in_a_row(num_views, len(pairs))
+    agree = (torch.arange(num_views)[:, None, None] == pairs).any(dim=-1)
+    pixels = torch.where(agree[..., None], scene.pixels, wrong)
+    found = triangulate_robust(scene.views.proj, pixels)
+    assert torch.equal(found.inliers, agree)
+    assert_close(found.points, scene.points, rtol=0, atol=1e-9)  # m
+
+
+@pytest.mark.parametrize("num_views", [12, 13, 30, 90])
+def test_many_views_are_judged_by_some_pairs(num_views: int) -> None:
+    scene, wrong = in_a_row(num_views, 60)
+    order = torch.arange(num_views)[:, None] + torch.arange(60)
+    # Two of five are wrong, and pairs must be of views that see the point: every other one.
+    agree, mask = order % 5 < 3, order * 3 // 2 % 2 == 0
+    pixels = torch.where(agree[..., None], scene.pixels, wrong)
+    found = triangulate_robust(scene.views.proj, pixels, mask=mask)
+    assert torch.equal(found.inliers, mask & agree)
+    assert_close(found.points, scene.points, rtol=0, atol=1e-9)  # m
+
+
+@given(drawn=spoiled())
+def test_gradients_are_those_of_the_inliers(drawn: tuple[PosedScene, Tensor, Tensor]) -> None:
+    scene, weights, outliers = drawn
+    pixels = scene.pixels.clone()
+    pixels[:, 3] = 1e4 * torch.arange(10).reshape(5, 2)  # none agree
+    inputs = [value.clone().requires_grad_() for value in (scene.views.proj, pixels, weights)]
+    found = triangulate_robust(*inputs)
+    wanted = triangulate(*inputs, found.inliers)
+    assert found.valid.tolist() == [True, True, True, False]
+    ours = torch.autograd.grad(found.points.sum() + found.residual.sum(), inputs)
+    plain = torch.autograd.grad(wanted.points.sum() + wanted.residual.sum(), inputs)
+    assert all(torch.equal(a, b) and a.isfinite().all() for a, b in zip(ours, plain, strict=True))
+    for gradient in ours[1:]:
+        assert (gradient[outliers] == 0).all() and (gradient[:, 3] == 0).all()
+        assert (gradient[:, 0] != 0).any()
+
+
+def test_gradcheck() -> None:
+    scene = ring()
+    pixels = scene.pixels.repeat(1, 2, 1) + torch.arange(16).reshape(4, 2, 2) / 16  # px
+    pixels[2, 0] += 60
+    weights = torch.linspace(0.5, 1.5, 8).double().reshape(4, 2)
+    inputs = tuple(value.clone().requires_grad_() for value in (scene.views.proj, pixels, weights))
+
+    def solve(proj: Tensor, pixels: Tensor, weights: Tensor) -> list[Tensor]:
+        found = triangulate_robust(proj, pixels, weights)
+        assert found.inliers.sum(dim=0).tolist() == [3, 4]
+        return [found.points, found.depth, found.residual]
+
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-5)
+
+
+@given(pixels=extreme(4, 4, 2), weights=extreme(4, 4), proj=extreme(4, 3, 4), wild=st.booleans())
+def test_no_input_gives_nan_or_inf(
+    pixels: Tensor, weights: Tensor, proj: Tensor, wild: bool
+) -> None:
+    pixels[0, 0], weights[1, 1] = torch.nan, torch.inf
+    for dtype in (torch.float32, torch.float64):
+        # As in test_triangulation: true gradients of 1e40 do not fit float32.
+        power = 0.25 if dtype == torch.float32 else 1
+        cameras = (proj.sign() * proj.abs() ** power if wild else ring().views.proj).to(dtype)
+        inputs = [
+            value.clone().requires_grad_()
+            for value in (cameras, pixels.to(dtype), (weights.abs() ** power).to(dtype))
+        ]
+        found = triangulate_robust(*inputs, threshold=100.0, covariance=True)
+        assert all(value is not None and value.isfinite().all() for value in found)
+        gradients = torch.autograd.grad(found.points.sum() + found.residual.sum(), inputs)
+        assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_many_points_are_solved_as_few_are() -> None:
+    scene = ring()
+    pixels = scene.pixels.repeat(1, 20000, 1)  # more than one chunk
+    generator = torch.Generator().manual_seed(0)
+    pixels = pixels + 60 * torch.randn(pixels.shape, generator=generator).double()
+    whole = triangulate_robust(scene.views.proj, pixels)
+    assert 0.1 < whole.valid.double().mean() < 0.9
+    for first in (0, 8180, 19960):
+        some = slice(first, first + 40)
+        part = triangulate_robust(scene.views.proj, pixels[:, some])
+        assert torch.equal(part.inliers, whole.inliers[:, some])
+        assert torch.equal(part.status, whole.status[some])

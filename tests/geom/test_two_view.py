@@ -1,0 +1,373 @@
+"""Optimal triangulation of two views, against refinement, OpenCV and by its invariants."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import (
+    PosedViews,
+    ShapeError,
+    Status,
+    camera_centers,
+    fundamental_between,
+    project,
+    refine_points,
+    reprojection_residual,
+    to_homogeneous,
+    triangulate,
+    triangulate_two_view,
+)
+from deltas_geom.testing import (
+    DEGENERATE_SCENES,
+    PosedScene,
+    default_intrinsics,
+    forward_motion,
+    on_baseline,
+    right_angle,
+    rigid,
+    scene_from,
+)
+from deltas_geom.testing.strategies import extreme, posed_scenes, scales, vectors
+
+
+@st.composite
+def noisy(draw: st.DrawFn, noise: float = 1.0) -> PosedScene:
+    """Two views of four points, and pixels that are off by up to ``noise`` px."""
+    scene = draw(posed_scenes())
+    offset = draw(vectors(8, within=noise, size=2)).reshape(2, 4, 2)
+    return scene._replace(pixels=scene.pixels + offset)
+
+
+def turned(angle: float, *, count: int = 500, noise: float = 1.0) -> PosedScene:
+    """Two cameras ``angle`` degrees apart, 4 m from a cloud of 1 m; Gaussian noise in px."""
+    generator = torch.Generator().manual_seed(0)
+    half = math.radians(angle) / 2
+    turns = torch.tensor([[0, half, 0], [0, -half, 0]], dtype=torch.float64)
+    pose = rigid(turns, torch.tensor([[0.0, 0, 4], [0, 0, 4]]).double())
+    views = PosedViews(default_intrinsics().expand(2, 3, 3), pose)
+    cloud = torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5
+    scene = scene_from(views, cloud)
+    off = torch.randn(scene.pixels.shape, generator=generator, dtype=torch.float64)
+    return scene._replace(pixels=scene.pixels + noise * off)
+
+
+def epipolar_error(views: PosedViews, pixels: Tensor) -> Tensor:
+    """Sampson's distance of pairs, px: to first order how far they would have to move."""
+    fundamental = fundamental_between(views)
+    first, second = to_homogeneous(pixels).unbind(dim=-3)
+    lines, back = first @ fundamental.mT, second @ fundamental
+    squared = lines[..., :2].square().sum(dim=-1) + back[..., :2].square().sum(dim=-1)
+    return (lines * second).sum(dim=-1) / squared.sqrt()
+
+
+def test_wrong_arguments_are_named() -> None:
+    proj, pixels = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2)
+    with pytest.raises(ShapeError, match=r"pixels must have shape \(\*B, 2, N, 2\), got \(3, 5"):
+        triangulate_two_view(proj, torch.zeros(3, 5, 2))
+    with pytest.raises(ShapeError, match=r"proj must have shape \(\*B, 2, 3, 4\), got \(3, 3"):
+        triangulate_two_view(torch.zeros(3, 3, 4), pixels)
+    with pytest.raises(ShapeError, match="pixels has N = 5 but mask has N = 4"):
+        triangulate_two_view(proj, pixels, torch.ones(2, 4, dtype=torch.bool))
+
+
+def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    pixels = scene.pixels.expand(4, 1, 2, 3, 2) + 1
+    mask = torch.ones(5, 2, 3, dtype=torch.bool)
+    result = triangulate_two_view(scene.views.proj, pixels, mask)
+    assert result.points.shape == (4, 5, 3, 3) and result.points.dtype == dtype
+    assert result.pixels.shape == (4, 5, 2, 3, 2) and result.depth.shape == (4, 5, 2, 3)
+    assert result.status.shape == result.residual.shape == result.parallax.shape == (4, 5, 3)
+    many = triangulate_two_view(scene.views.proj.expand(6, 2, 3, 4), scene.pixels + 1)
+    assert_close(many.points[5], result.points[0, 0])
+    assert_close(many.pixels[5], result.pixels[0, 0])
+    none = triangulate_two_view(scene.views.proj, scene.pixels[:, :0])
+    assert none.points.shape == (0, 3) and none.pixels.shape == (2, 0, 2)
+
+
+def test_many_points_are_solved_as_few_are() -> None:
+    scene = turned(20, count=9000)
+    whole = triangulate_two_view(scene.views.proj, scene.pixels)
+    some = slice(8180, 8200)
+    part = triangulate_two_view(scene.views.proj, scene.pixels[:, some])
+    assert_close(whole.points[some], part.points, rtol=0, atol=1e-12)
+    assert_close(whole.pixels[:, some], part.pixels, rtol=0, atol=1e-10)
+
+
+@given(scene=posed_scenes())
+def test_pixels_without_noise_stay_and_give_the_point(scene: PosedScene) -> None:
+    result = triangulate_two_view(scene.views.proj, scene.pixels)
+    assert result.valid.all()
+    assert_close(result.pixels, scene.pixels, rtol=0, atol=1e-10)  # px
+    assert_close(result.points, scene.points, rtol=0, atol=1e-9)  # m
+    assert_close(result.depth, project(scene.views, scene.points).depth, rtol=0, atol=1e-9)
+    assert (result.residual < 1e-10).all()  # px
+
+
+@given(scene=noisy())
+def test_corrected_pixels_meet_on_the_point_that_they_show(scene: PosedScene) -> None:
+    result = triangulate_two_view(scene.views.proj, scene.pixels)
+    assert result.valid.all()
+    assert (epipolar_error(scene.views, result.pixels).abs() < 1e-9).all()  # px
+    shown = project(scene.views, result.points)
+    assert_close(shown.pixels, result.pixels, rtol=0, atol=1e-9)  # px
+    assert_close(shown.depth, result.depth, rtol=0, atol=1e-12)  # m
+    residual = reprojection_residual(
+        scene.views.proj, result.points, scene.pixels, torch.ones_like(result.depth)
+    )
+    assert_close(result.residual, residual, rtol=0, atol=1e-9)  # px
+    assert_close(
+        result.parallax, triangulate(scene.views.proj, result.pixels).parallax, rtol=0, atol=1e-9
+    )
+
+
+@given(scene=noisy(noise=5.0))
+def test_no_point_of_dlt_is_better(scene: PosedScene) -> None:
+    result = triangulate_two_view(scene.views.proj, scene.pixels)
+    by_dlt = triangulate(scene.views.proj, scene.pixels)
+    both = result.valid & by_dlt.valid
+    assert (result.residual <= by_dlt.residual + 1e-9)[both].all()  # px, rounding
+
+
+@given(scene=noisy())
+def test_the_order_of_the_views_does_not_count(scene: PosedScene) -> None:
+    one = triangulate_two_view(scene.views.proj, scene.pixels)
+    other = triangulate_two_view(scene.views.proj.flip(0), scene.pixels.flip(0))
+    assert_close(other.points, one.points, rtol=0, atol=1e-10)  # m
+    assert_close(other.pixels.flip(0), one.pixels, rtol=0, atol=1e-10)  # px
+    assert_close(other.depth.flip(0), one.depth, rtol=0, atol=1e-10)  # m
+
+
+@given(
+    scene=noisy(),
+    turn=vectors(1, within=3.0),
+    shift=vectors(1, within=10.0),
+    scale=scales(decades=2),
+)
+def test_points_move_with_the_world_and_pixels_stay(
+    scene: PosedScene, turn: Tensor, shift: Tensor, scale: float
+) -> None:
+    new_from_world = rigid(turn, shift)[0]
+    cam_from_new = scene.views.cam_from_world @ torch.linalg.inv(new_from_world)
+    cam_from_new[:, :3, 3] *= scale
+    here = triangulate_two_view(scene.views.proj, scene.pixels)
+    there = triangulate_two_view(PosedViews(scene.views.K, cam_from_new).proj, scene.pixels)
+    wanted = scale * (here.points @ new_from_world[:3, :3].mT + new_from_world[:3, 3])
+    assert_close(there.points, wanted, rtol=0, atol=1e-8 * scale)
+    assert_close(there.pixels, here.pixels, rtol=0, atol=1e-8)  # px
+
+
+@pytest.mark.parametrize("angle", [1, 3, 10, 30, 90])
+def test_the_cost_is_that_of_many_gauss_newton_steps(angle: float) -> None:
+    scene = turned(angle)
+    result = triangulate_two_view(scene.views.proj, scene.pixels)
+    start = triangulate(scene.views.proj, scene.pixels)
+    optimum = refine_points(scene.views.proj, scene.pixels, start.points, steps=20)
+    assert result.valid.all() and optimum.valid.all()
+    # Where the cost itself is next to nothing only its rounding can differ.
+    assert_close(result.residual**2, optimum.residual**2, rtol=1e-6, atol=1e-10)  # px^2
+    # DLT is worse by more than the tolerance, or this would test nothing.
+    worse = (start.residual**2 / optimum.residual**2 - 1).max()
+    assert worse > 3e-6
+
+
+@given(scene=noisy())
+def test_cameras_that_differ_come_close_to_the_optimum(scene: PosedScene) -> None:
+    result = triangulate_two_view(scene.views.proj, scene.pixels)
+    optimum = refine_points(scene.views.proj, scene.pixels, result.points, steps=20)
+    assert_close(result.residual**2, optimum.residual**2, rtol=1e-5, atol=1e-10)  # px^2
+
+
+@pytest.mark.parametrize(("noise", "tolerance"), [(1, 1e-6), (10, 1e-3)])
+@pytest.mark.parametrize("angle", [3, 30, 90])
+def test_opencv_corrects_matches_as_we_do(angle: float, noise: float, tolerance: float) -> None:
+    scene = turned(angle, noise=noise)
+    result = triangulate_two_view(scene.views.proj, scene.pixels)
+    # OpenCV: points2^T F points1 = 0, and points in one row of two channels.
+    fundamental = fundamental_between(scene.views).numpy()
+    first, second = (pixels.numpy()[None] for pixels in scene.pixels)
+    corrected = torch.from_numpy(np.concatenate(cv2.correctMatches(fundamental, first, second)))
+    finite = corrected.isfinite().all(dim=-1).all(dim=0) & result.valid
+    assert finite.double().mean() > 0.8
+    assert_close(result.pixels[:, finite], corrected[:, finite], rtol=0, atol=tolerance)  # px
+    # Where we differ, the roots of OpenCV's polynomial have lost digits: its cost is higher.
+    theirs = (corrected - scene.pixels).square().sum(dim=-1).sum(dim=0)
+    assert (2 * result.residual**2 <= theirs + 1e-10)[finite].all()  # px^2
+
+
+def test_there_is_no_better_pair_of_epipolar_lines() -> None:
+    # Hartley and Sturm: the cost of a pair of lines is a function of the line's angle alone.
+    scene = forward_motion()
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(2, 200, 2, generator=generator, dtype=torch.float64)
+    pixels = scene.pixels[:, torch.arange(200) % 3] + 3 * noise
+    result = triangulate_two_view(scene.views.proj, pixels)
+    epipole = torch.tensor([320.0, 240.0]).double()  # of both, and lines have the same angle
+    angle = torch.linspace(0, math.pi, 20001, dtype=torch.float64)
+    normal = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    cost = ((pixels - epipole) @ normal.mT).square().sum(dim=0).amin(dim=-1)
+    valid = result.valid
+    assert valid.double().mean() > 0.9
+    assert_close(2 * result.residual[valid] ** 2, cost[valid], rtol=1e-3, atol=1e-3)  # px^2
+
+
+def test_gross_errors_near_the_epipoles_still_end_on_corresponding_lines() -> None:
+    # Different focal lengths along x and y: Lindstrom's quadratic has no real root here.
+    K = torch.tensor([[2000.0, 0, 320], [0, 200, 240], [0, 0, 1]]).double()
+    pose = torch.eye(4).double().repeat(2, 1, 1)
+    pose[1, 2, 3] = -0.5
+    pose[1, :3, :3] = rigid(torch.tensor([0.0, 0, 1.5]), torch.zeros(3))[:3, :3]
+    views = PosedViews(K.expand(2, 3, 3), pose)
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.tensor([320.0, 240]) + 30 * torch.randn(2, 2000, 2, generator=generator).double()
+    result = triangulate_two_view(views.proj, pixels)
+    assert result.valid.any()
+    assert (epipolar_error(views, result.pixels)[result.valid].abs() < 1e-8).all()  # px
+    shown = project(views, result.points)
+    assert_close(shown.pixels[:, result.valid], result.pixels[:, result.valid], rtol=0, atol=1e-7)
+    by_dlt = triangulate(views.proj, pixels)
+    both = result.valid & by_dlt.valid
+    assert (result.residual <= by_dlt.residual)[both].double().mean() > 0.95
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0, 5.0])
+@pytest.mark.parametrize("motion", ["forward", "90 degrees", "5 degrees"])
+def test_gradients_are_right(motion: str, noise: float) -> None:
+    scene = forward_motion() if motion == "forward" else turned(float(motion[:2]), count=3, noise=0)
+    generator = torch.Generator().manual_seed(1)
+    off = torch.randn(scene.pixels.shape, generator=generator, dtype=torch.float64)
+    inputs = [scene.views.proj.requires_grad_(), (scene.pixels + noise * off).requires_grad_()]
+
+    def solve(proj: Tensor, pixels: Tensor) -> list[Tensor]:
+        result = triangulate_two_view(proj, pixels)
+        # At no noise the residual's slope is a choice.
+        return [result.points, result.pixels, result.depth, result.residual * (noise > 0)]
+
+    assert triangulate_two_view(*inputs).valid.all()
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-5)
+
+
+def test_second_derivatives_are_right() -> None:
+    scene = right_angle()
+
+    def solve(pixels: Tensor) -> Tensor:
+        return triangulate_two_view(scene.views.proj, pixels).points
+
+    pixels = (scene.pixels + torch.tensor([[[3.0, -2.0]], [[1.0, 2.0]]])).requires_grad_()
+    assert torch.autograd.gradgradcheck(solve, (pixels,), eps=1e-3, atol=1e-6)
+
+
+@given(scene=noisy())
+def test_float32_is_within_its_bound_of_float64(scene: PosedScene) -> None:
+    proj, pixels = scene.views.proj.float(), scene.pixels.float()
+    single = triangulate_two_view(proj, pixels)
+    exact = triangulate_two_view(proj.double(), pixels.double())
+    # Computed in float64 either way: only the result is rounded, at 5 m and 1000 px.
+    assert_close(single.points.double(), exact.points, rtol=0, atol=6e-8 * 8)  # m
+    assert_close(single.pixels.double(), exact.pixels, rtol=0, atol=6e-8 * 1024)  # px
+
+
+@pytest.mark.parametrize("name", DEGENERATE_SCENES)
+def test_named_scenes_have_the_status_of_dlt(name: str, dtype: torch.dtype) -> None:
+    scene = DEGENERATE_SCENES[name](dtype=dtype)
+    proj = scene.views.proj[:2].requires_grad_()
+    pixels = scene.pixels[:2].clone().requires_grad_()
+    result = triangulate_two_view(proj, pixels)
+    wanted = triangulate(proj, pixels)
+    assert torch.equal(result.status, wanted.status)
+    assert_close(result.points, wanted.points, rtol=1e-5, atol=1e-5)  # m
+    total = result.points.sum() + result.residual.sum() + result.pixels.sum() + result.depth.sum()
+    for value in (*result, *torch.autograd.grad(total, (proj, pixels))):
+        assert value.isfinite().all()
+
+
+def test_status_tells_the_truth(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    pixels = scene.pixels[:, :1].repeat(1, 8, 1)
+    pixels[1, 1] = pixels[0, 1]  # a star
+    pixels[0, 2, 0] = torch.nan
+    pixels[1, 3, 1] = torch.inf
+    pixels[:, 4] = on_baseline(dtype=dtype).pixels[:, 0]  # both epipoles
+    pixels[1, 5] = on_baseline(dtype=dtype).pixels[1, 0]  # one: the point is the other camera
+    pixels[:, 6] = pixels[:, 6].flip(0)  # the lines meet behind
+    mask = torch.ones(2, 8, dtype=torch.bool)
+    mask[1, 7] = False
+    inputs = [value.clone().requires_grad_() for value in (scene.views.proj, pixels)]
+    result = triangulate_two_view(*inputs, mask)
+    assert [Status(value).name for value in result.status.tolist()] == [
+        "OK",
+        "AT_INFINITY",
+        "NOT_FINITE_INPUT",
+        "NOT_FINITE_INPUT",
+        "NO_PARALLAX",
+        "BEHIND_CAMERA",
+        "BEHIND_CAMERA",
+        "TOO_FEW_VIEWS",
+    ]
+    assert (result.points[1:] == 0).all() and (result.depth[:, 1:] == 0).all()
+    assert (result.residual[1:] == 0).all()
+    assert torch.equal(result.pixels[:, 4:7], pixels[:, 4:7]) and result.pixels[0, 2, 0] == 0
+    total = result.points.sum() + result.depth.sum() + result.residual.sum() + result.pixels.sum()
+    of_proj, of_pixels = torch.autograd.grad(total, inputs)
+    assert of_proj.isfinite().all() and of_pixels.isfinite().all()
+    assert (of_pixels[:, 1:] == 0).all() and (of_pixels[:, 0] != 0).any()
+
+
+@pytest.mark.parametrize("view", [0, 1])
+@pytest.mark.parametrize("angle", [5, 40, 90])
+def test_a_pixel_on_its_epipole_shows_the_other_camera(angle: float, view: int) -> None:
+    scene = turned(angle)
+    center = camera_centers(scene.views.cam_from_world)[1 - view]
+    x, y, w = (scene.views.proj[view] @ to_homogeneous(center)).tolist()
+    pixels = scene.pixels.clone()
+    pixels[view] = torch.tensor([x / w, y / w])
+    result = triangulate_two_view(scene.views.proj, pixels)
+    assert (result.status == Status.BEHIND_CAMERA).all()
+
+
+def test_a_masked_pixel_may_hold_anything() -> None:
+    scene = forward_motion()
+    pixels = scene.pixels.clone()
+    pixels[1, 0] = torch.nan
+    mask = torch.tensor([[True, True, True], [False, True, True]])
+    result = triangulate_two_view(scene.views.proj, pixels, mask)
+    assert result.status.tolist() == [Status.TOO_FEW_VIEWS, Status.OK, Status.OK]
+    assert_close(result.points[1:], scene.points[1:])
+
+
+@pytest.mark.parametrize("spoiled", [torch.nan, torch.inf, 0.0])
+def test_a_camera_without_an_image_is_told(spoiled: float) -> None:
+    scene = forward_motion()
+    proj = scene.views.proj.clone()
+    proj[1] = spoiled
+    proj.requires_grad_()
+    result = triangulate_two_view(proj, scene.pixels)
+    wanted = Status.NOT_FINITE_INPUT if spoiled else Status.NO_PARALLAX
+    assert (result.status == wanted).all()
+    gradient = torch.autograd.grad(result.points.sum() + result.residual.sum(), proj)[0]
+    assert (gradient == 0).all()
+
+
+@given(pixels=extreme(2, 4, 2), proj=extreme(2, 3, 4), wild=st.booleans())
+def test_no_finite_input_gives_nan_or_inf(pixels: Tensor, proj: Tensor, wild: bool) -> None:
+    for dtype in (torch.float32, torch.float64):
+        # A true gradient of 1e40 does not fit float32: numbers up to 1e7 there.
+        power = 0.25 if dtype == torch.float32 else 1
+        inputs = [
+            (value.sign() * value.abs() ** power).to(dtype).requires_grad_()
+            for value in (proj if wild else right_angle().views.proj, pixels)
+        ]
+        result = triangulate_two_view(*inputs)
+        assert all(value.isfinite().all() for value in result)
+        total = (
+            result.points.sum() + result.depth.sum() + result.residual.sum() + result.pixels.sum()
+        )
+        for gradient in torch.autograd.grad(total, inputs):
+            assert gradient.isfinite().all()
