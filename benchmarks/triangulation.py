@@ -1,20 +1,28 @@
-"""Weighted n-view triangulation beside the SVD that it replaces, one thread, answers first.
+"""Triangulation beside its peers: one thread, answers first, ratios from one run.
 
-python benchmarks/triangulation.py
+python benchmarks/triangulation.py [forward] [two-view] [float64] [compiled] [backward] [singly]
+
+Peers that are not installed are left out: pip install 'deltas-depth[test]' pycolmap gtsam
 """
 
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from deltas_geom import PosedViews, project, triangulate_points
+from deltas_geom import PosedViews, project, refine_points, triangulate, triangulate_points
 from deltas_geom.testing import rigid
+from deltas_geom.testing.targets import KORNIA_SOLVERS, kornia, opencv
 
 NUM_POINTS = 100_000
-REPEATS = 5
+REPEATS = 7
+# Inductor would cut the one loop into pieces, and carry everything between them through memory.
+COMPILED = {"fullgraph": True, "dynamic": False, "options": {"max_fusion_size": 2000}}
+Scene = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def svd_dlt(proj: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
@@ -25,7 +33,7 @@ def svd_dlt(proj: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
     return vector[:, :3] / vector[:, 3:]
 
 
-def scene(num_views: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def scene(num_views: int) -> Scene:
     """Cameras in a row, points 3 to 6 m ahead, 0.5 px of noise; float32."""
     random = torch.Generator().manual_seed(num_views)
     K = torch.tensor([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]).expand(num_views, 3, 3)
@@ -39,29 +47,212 @@ def scene(num_views: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return views.proj, pixels, torch.rand(num_views, NUM_POINTS, generator=random) + 0.1, points
 
 
-def milliseconds(run: Callable[[], object]) -> float:
-    """Median processor time."""
-    times = []
-    for _ in range(REPEATS):
-        began = time.process_time()
-        run()
-        times.append(time.process_time() - began)
-    return 1000 * statistics.median(times)
+def milliseconds(*runs: Callable[[], object]) -> list[float]:
+    """Median processor time of each, taken in turns so that all see the same machine."""
+    times: list[list[float]] = [[] for _ in runs]
+    for repeat in range(REPEATS + 1):
+        for run, seen in zip(runs, times, strict=True):
+            began = time.process_time()
+            run()
+            if repeat:  # the first is a warm-up
+                seen.append(time.process_time() - began)
+    return [1000 * statistics.median(seen) for seen in times]
+
+
+def check(points: Tensor, found: Tensor, peer: Tensor) -> None:
+    """Not worth timing unless as accurate."""
+    ours, theirs = ((x - points).norm(dim=-1).median() for x in (found, peer))
+    assert ours <= 1.02 * theirs, f"median error {ours:.4f} m, the peer's {theirs:.4f} m"
+
+
+def row(name: str, ours: float, peers: dict[str, tuple[float, str]]) -> None:
+    """One line: our time, and how many times as long each peer takes; its goal in brackets."""
+    shown = "  ".join(
+        f"{peer} {ms:.0f} = {ms / ours:.1f}x ({goal})" for peer, (ms, goal) in peers.items()
+    )
+    print(f"{name:<34} {ours:7.1f} ms   {shown}", flush=True)
+
+
+@torch.no_grad()
+def forward() -> None:
+    for num_views in (2, 3, 5, 8):
+        proj, pixels, weights, points = scene(num_views)
+        check(points, triangulate_points(proj, pixels, weights), svd_dlt(proj, pixels, weights))
+        start = triangulate_points(proj, pixels, weights)
+        ours, svd, known, noise, step = milliseconds(
+            lambda: triangulate_points(proj, pixels, weights),  # noqa: B023
+            lambda: svd_dlt(proj, pixels, weights),  # noqa: B023
+            lambda: triangulate(proj, pixels, weights),  # noqa: B023
+            lambda: triangulate(proj, pixels, weights, covariance=True),  # noqa: B023
+            lambda: refine_points(proj, pixels, start, weights),  # noqa: B023
+        )
+        row(f"{num_views} views, points alone", ours, {"torch SVD": (svd, "8")})
+        shares = f"covariance {(noise - known) / known:.2f} (0.7), one Gauss-Newton step"
+        print(f"{'':4}with status, residual, parallax {known:.1f} ms; of that: {shares}", end=" ")
+        print(f"{step / known:.2f} (1), of points alone {step / ours:.2f}", flush=True)
+
+
+@torch.no_grad()
+def two_view() -> None:
+    proj, pixels, _, points = scene(2)
+    peers = {"OpenCV": (opencv(), "2")} | {
+        f"kornia {solver}": (kornia(solver), goal)
+        for solver, goal in zip(KORNIA_SOLVERS, ("6", "10", "2"), strict=True)
+    }
+    runs = [lambda: triangulate_points(proj, pixels)]
+    for target, _ in peers.values():
+        solve = target.triangulate
+        assert solve is not None
+        check(points, triangulate_points(proj, pixels), solve(proj, pixels, None))
+        runs.append(lambda solve=solve: solve(proj, pixels, None))  # type: ignore[misc]
+    ours, *theirs = milliseconds(*runs)
+    goals = [goal for _, goal in peers.values()]
+    row("2 views, no weights", ours, dict(zip(peers, zip(theirs, goals, strict=True), strict=True)))
+
+
+@torch.no_grad()
+def float64() -> None:
+    for num_views in (2, 5, 8):
+        proj, pixels, weights, points = (t.double() for t in scene(num_views))
+        check(points, triangulate_points(proj, pixels, weights), svd_dlt(proj, pixels, weights))
+        ours, svd = milliseconds(
+            lambda: triangulate_points(proj, pixels, weights),  # noqa: B023
+            lambda: svd_dlt(proj, pixels, weights),  # noqa: B023
+        )
+        row(f"{num_views} views, float64", ours, {"torch SVD": (svd, "5")})
+
+
+@torch.no_grad()
+def compiled() -> None:
+    for num_views in (2, 5):
+        proj, pixels, weights, points = scene(num_views)
+        fast = torch.compile(triangulate_points, **COMPILED)  # type: ignore[call-overload]
+        check(points, fast(proj, pixels, weights), svd_dlt(proj, pixels, weights))
+        ours, svd = milliseconds(
+            lambda: fast(proj, pixels, weights),  # noqa: B023
+            lambda: svd_dlt(proj, pixels, weights),  # noqa: B023
+        )
+        row(f"{num_views} views, compiled", ours, {"torch SVD": (svd, "20")})
+
+
+def kept(solve: Callable[..., Tensor], inputs: list[Tensor]) -> float:
+    """Megabytes that autograd keeps for backward, inputs included."""
+    storages = {}
+
+    def pack(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        storages[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        solve(*inputs)
+    return sum(storages.values()) / 1e6
+
+
+def _there_and_back(solve: Callable[..., Tensor], inputs: list[Tensor]) -> None:
+    solve(*inputs).sum().backward()
+
+
+def backward() -> None:
+    for num_views in (2, 5):
+        *tensors, points = scene(num_views)
+        inputs = [tensor.requires_grad_() for tensor in tensors]
+        fast = torch.compile(triangulate_points, **COMPILED)  # type: ignore[call-overload]
+        solvers: list[Callable[..., Tensor]] = [triangulate_points, fast, svd_dlt]
+        if num_views == 2:
+            cofactor = kornia("cofactor").triangulate
+            solvers.append(lambda proj, pixels, weights: cofactor(proj, pixels, None))  # noqa: B023
+        check(points, triangulate_points(*inputs), svd_dlt(*inputs))
+        gradients = [torch.autograd.grad(f(*inputs).sum(), inputs[1])[0] for f in solvers[:2]]
+        torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-3, atol=1e-5)
+        runs = [partial(_there_and_back, solve, inputs) for solve in solvers[:3]]
+        ours, quick, svd = milliseconds(*runs)
+        row(f"{num_views} views, forward + backward", ours, {"torch SVD": (svd, "2.2")})
+        row(f"{num_views} views, the same compiled", quick, {"torch SVD": (svd, "7")})
+        ours_mb, _, svd_mb, *other = (kept(f, inputs) for f in solvers)
+        shown = f"torch SVD {svd_mb:.1f} = {svd_mb / ours_mb:.1f}x (4)"
+        if other:
+            shown += f", kornia cofactor {other[0]:.1f} = {other[0] / ours_mb:.1f}x (8)"
+        print(f"{'':4}kept for backward: {ours_mb:.1f} MB, {shown}", flush=True)
+
+
+@torch.no_grad()
+def singly() -> None:
+    """Libraries that take a point at a time, from Python, on some of the points."""
+    few = 5000
+    for num_views in (2, 5):
+        proj, pixels, _, points = scene(num_views)
+        ours = milliseconds(lambda: triangulate_points(proj, pixels))[0] / NUM_POINTS  # noqa: B023
+        peers: dict[str, tuple[float, str]] = {}
+        for name, make, goal in (("pycolmap", _pycolmap, "10"), ("gtsam", _gtsam, "40")):
+            try:
+                solve = make(proj, pixels[:, :few])
+            except ImportError:
+                continue
+            check(points[:few], triangulate_points(proj, pixels[:, :few]), solve())
+            peers[name] = (milliseconds(solve)[0] / few * NUM_POINTS, goal)
+        row(f"{num_views} views, beside a point at a time", ours * NUM_POINTS, peers)
+
+
+def _pycolmap(proj: Tensor, pixels: Tensor) -> Callable[[], Tensor]:
+    import pycolmap
+
+    # It takes calibrated rays: the intrinsics are those of the scene, known to be the same.
+    K = torch.tensor([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]).double()
+    poses = [pose.numpy() for pose in torch.linalg.inv(K) @ proj.double()]
+    rays = torch.nn.functional.pad((pixels.double() - K[:2, 2]) / 300, (0, 1), value=1.0)
+    rays = torch.nn.functional.normalize(rays, dim=-1)
+    seen = [ray.numpy() for ray in rays.transpose(0, 1)]
+
+    def solve() -> Tensor:
+        found = [pycolmap.triangulate_multi_view_point(poses, ray) for ray in seen]
+        return torch.tensor([[float(x) for x in point] for point in found])
+
+    return solve
+
+
+def _gtsam(proj: Tensor, pixels: Tensor) -> Callable[[], Tensor]:
+    import gtsam
+
+    K = torch.tensor([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]).double()
+    calibration = gtsam.Cal3_S2(300.0, 300.0, 0.0, 160.0, 120.0)
+    poses = gtsam.Pose3Vector()
+    for extrinsic in torch.linalg.inv(K) @ proj.double():
+        rotation, translation = extrinsic[:, :3], extrinsic[:, 3]
+        center = (-rotation.mT @ translation).numpy()
+        poses.append(gtsam.Pose3(gtsam.Rot3(rotation.mT.numpy()), center))
+    seen = []
+    for point in pixels.double().transpose(0, 1):
+        matches = gtsam.Point2Vector()
+        for pixel in point:
+            matches.append(pixel.numpy())
+        seen.append(matches)
+
+    def solve() -> Tensor:
+        found = [
+            gtsam.triangulatePoint3(poses, calibration, one, 1e-9, False)  # rank, no refinement
+            for one in seen
+        ]
+        return torch.tensor([[float(x) for x in point] for point in found])
+
+    return solve
+
+
+PARTS = {
+    "forward": forward,
+    "two-view": two_view,
+    "float64": float64,
+    "compiled": compiled,
+    "backward": backward,
+    "singly": singly,
+}
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    print(f"{NUM_POINTS} weighted points, float32, milliseconds of processor time")
-    print(f"{'views':>5} {'ours':>8} {'torch SVD':>10} {'ratio':>6}   median error, ours / SVD, mm")
-    for num_views in (2, 3, 5, 8):
-        proj, pixels, weights, points = scene(num_views)
-        ours, svd = triangulate_points(proj, pixels, weights), svd_dlt(proj, pixels, weights)
-        errors = [1000 * float((found - points).norm(dim=-1).median()) for found in (ours, svd)]
-        assert errors[0] <= 1.02 * errors[1], "less accurate than the SVD: not worth timing"
-        fast = milliseconds(lambda: triangulate_points(proj, pixels, weights))  # noqa: B023
-        slow = milliseconds(lambda: svd_dlt(proj, pixels, weights))  # noqa: B023
-        shown = f"{errors[0]:.2f} / {errors[1]:.2f}"
-        print(f"{num_views:>5} {fast:8.1f} {slow:10.1f} {slow / fast:6.1f}   {shown}")
+    print(f"{NUM_POINTS} points, milliseconds of processor time; (goals) are 'at least'")
+    for name in sys.argv[1:] or PARTS:
+        PARTS[name]()
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from deltas_geom.matching import (
     match_joint,
     match_per_view,
     soft_argmax,
+    weights_from_covariance,
 )
 from deltas_geom.midpoint import triangulate_inverse_depth_weighted, triangulate_midpoint
 from deltas_geom.modules import DepthRasterizer, EpipolarSampler, Triangulator
@@ -104,4 +105,5 @@ __all__ = [
     "triangulate_tracks",
     "triangulate_two_view",
     "unproject",
+    "weights_from_covariance",
 ]

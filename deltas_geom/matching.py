@@ -21,7 +21,11 @@ class Matches(NamedTuple):
 
     Attributes:
         pixels: ``(*B, V, N, 2)``; entry 0 is the keypoint itself, sources follow in order.
-        weights: ``(*B, V, N)`` not negative; the anchor's is 1.
+        weights: ``(*B, V, N)`` not negative; the anchor's is 1. Of :func:`match_per_view` and
+            :func:`match_joint` they are shares of probability, 0 to 1: right as the paper's
+            weights of a DLT, where only their ratios count. They are not 1/px, which the
+            covariance of :func:`deltas_geom.triangulate` and ``point_covariance`` read a weight
+            as: for these take :func:`weights_from_covariance`.
         covariance: ``(*B, V, N, 2, 2)`` px^2; the anchor's is 0.
         mask: ``(*B, V, N)`` bool: the view has a match.
     """
@@ -115,10 +119,48 @@ def matches_from_sources(
     )
 
 
+def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor:
+    """Weights in 1/px from the covariance of matches, as triangulation's covariance reads them.
+
+    1 / sqrt(s^2 + floor^2), with s^2 the mean variance over the two axes: half the trace, which
+    no turn of the image changes. Triangulation takes the noise of a view as round; this is the
+    round noise with the same mean squared error.
+
+    Args:
+        covariance: ``(*B, 2, 2)`` px^2, for example of :class:`Matches`.
+        floor: px, what a match errs even where its distribution is sharp: the localisation of
+            keypoints, the spacing of samples, errors of poses. It bounds all weights, and a
+            match without variance, such as the anchor's, has the weight 1 / floor.
+
+    Returns:
+        ``(*B)`` between 0 and 1 / floor. A variance that is NaN or infinite, or below 0 by more
+        than the floor, has the weight 0: unused.
+
+    Raises:
+        ShapeError: the covariance is not ``(*B, 2, 2)``.
+        ValueError: the floor is not positive.
+
+    Example:
+        >>> matched = torch.diag(torch.tensor([24.0, 7.5]))  # px^2
+        >>> weights_from_covariance(torch.stack([0 * matched, matched]), floor=0.5)
+        tensor([2.0000, 0.2500])
+    """
+    check_shapes(covariance=(covariance, "2 2"))
+    if not floor > 0:
+        raise ValueError(f"floor must be positive, got {floor}")
+    variance = (covariance[..., 0, 0] + covariance[..., 1, 1]) / 2 + floor**2
+    known = variance.isfinite() & (variance > 0)
+    # Double where: the unused branch must not turn the gradient into NaN.
+    return torch.where(known, torch.where(known, variance, 1.0).rsqrt(), 0.0)
+
+
 def match_per_view(
     keypoints: Tensor, scores: Tensor, samples: Samples, *, window: int | None = None
 ) -> Matches:
     """Match in every source alone: soft-argmax over all its samples, weight = peak.
+
+    The peak is a probability, without unit, and falls as samples get denser: a weight of 0.5 does
+    not mean noise of 2 px. See :func:`weights_from_covariance`.
 
     Args:
         keypoints: ``(*B, N, 2)`` of the anchor.
@@ -151,6 +193,9 @@ def match_joint(
     window: int | None = 2,
 ) -> Matches:
     """Match in all sources at once: mean score at common inverse depths, one soft-argmax.
+
+    All sources of a keypoint share one weight, the peak's probability, without unit; see
+    :func:`weights_from_covariance`. Their errors are one error of depth, not independent ones.
 
     Args:
         views: the anchor (view 0) and its V-1 sources.

@@ -87,6 +87,62 @@ def solve3(normal: Symmetric3, right: Vector3) -> tuple[Vector3, Tensor]:
     return (z0, z1, z2), definite
 
 
+def solve3_scaled(normal: Symmetric3, right: Vector3) -> tuple[Vector3, Tensor]:
+    """:func:`solve3` of any finite matrices; finite, with finite gradients, if not definite.
+
+    A matrix whose trace is so large or small that squares of it leave the range of numbers
+    counts as not definite.
+    """
+    with torch.no_grad():
+        trace = normal[0] + normal[3] + normal[5]
+        largest = torch.finfo(trace.dtype).max ** 0.45
+        ordinary = (trace > 1 / largest) & (trace < largest)
+        share = torch.where(ordinary, trace.reciprocal(), trace.new_zeros(()))
+    m00, m01, m02, m11, m12, m22 = (entry * share for entry in normal)
+    r0, r1, r2 = (entry * share for entry in right)
+    return solve3((m00, m01, m02, m11, m12, m22), (r0, r1, r2))
+
+
+def second_derivative(
+    normal: Symmetric3,
+    proj: Tensor,
+    place: tuple[Tensor, Tensor],
+    offset: tuple[Tensor, Tensor],
+    inverse: Tensor,
+    influence: Tensor,
+    bend: Tensor,
+) -> Symmetric3:
+    """Second derivative by points of half the sum of w^2 rho(e^2), e the reprojection errors.
+
+    Args:
+        normal: J^T W^2 J with the weights w^2 rho', six ``(*B, N)``.
+        proj: ``(*B, V, 3, 4)``.
+        place: x and y ``(*B, V, N)`` px of the projected points.
+        offset: x and y ``(*B, V, N)`` px of the errors.
+        inverse: ``(*B, V, N)`` 1 / depth.
+        influence: ``(*B, V, N)`` w^2 rho'.
+        bend: ``(*B, V, N)`` 2 w^2 rho''.
+
+    Source: Triggs et al., Bundle Adjustment: A Modern Synthesis (2000), section 4.3.
+    """
+    (x, y), (dx, dy) = place, offset
+    p1, p2, p3 = proj[..., :3].unsqueeze(-2).unbind(dim=-3)  # (*B, V, 1, 3)
+    along = dx * x + dy * y
+    # J^T e of each view. A change of the point changes J by -(J p3^T + p3 J^T) / depth.
+    slope = [(dx * p1[..., i] + dy * p2[..., i] - along * p3[..., i]) * inverse for i in range(3)]
+    turn = [influence * inverse * p3[..., i] for i in range(3)]
+
+    def entry(i: int, j: int) -> Tensor:
+        bent = bend * slope[i] * slope[j] - turn[i] * slope[j] - turn[j] * slope[i]
+        return bent.sum(dim=-2)
+
+    m00, m01, m02, m11, m12, m22 = normal
+    return (
+        m00 + entry(0, 0), m01 + entry(0, 1), m02 + entry(0, 2),
+        m11 + entry(1, 1), m12 + entry(1, 2), m22 + entry(2, 2),
+    )  # fmt: skip
+
+
 def inverse3(normal: Symmetric3) -> Symmetric3:
     """Inverses of semidefinite 3x3 matrices.
 

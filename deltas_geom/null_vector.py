@@ -55,9 +55,8 @@ def null_vector(
     noise = rounding(matrix)
     # Above the null space by the rounding of M, every pivot is positive.
     factors = _factor(_shifted(matrix, -noise))
-    one = torch.ones_like(noise)
-    x = (0.13 * one, 0.07 * one, 0.11 * one, one)
-    for _ in range(_INVERSE_ITERATIONS):
+    x = _start(factors)
+    for _ in range(_INVERSE_ITERATIONS - 1):
         x = _solve_scaled(factors, x)
     x = unit(x)  # before it overflows: towards infinity each solve makes it longer
     near = _solve_scaled(factors, x)
@@ -74,8 +73,8 @@ def null_vector(
 
     # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
     factors = _factor(_shifted(matrix, quotient + noise))
-    i0, i1, i2, d3 = factors[:4]
-    simple = i0.sign() + i1.sign() + i2.sign() + d3.sign() == 2
+    signs = factors.i0.sign() + factors.i1.sign() + factors.i2.sign() + factors.d3.sign()
+    simple = signs == 2
     vector = _solve_scaled(factors, (x0, x1, x2, x3))
     if product is not None:
         for _ in range(polish):
@@ -83,13 +82,13 @@ def null_vector(
     return NullVector(vector, simple)
 
 
-def _polished(factors: "_Factors", x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
+def _polished(f: "_Factors", x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
     """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
     image = product(x)
     mu = dot(x, image)
     g0, g1, g2, g3 = (_less(image[i], mu, x[i]) for i in range(4))
-    inverse = 1 / factors[3]
-    scaled = _solve_scaled(factors, (g0, g1, g2, g3))
+    inverse = f.d3.reciprocal()
+    scaled = _solve_scaled(f, (g0, g1, g2, g3))
     # What the solve amplifies is along x, and goes.
     along = dot(x, scaled)
     x0, x1, x2, x3 = (_less(x[i], inverse, _less(scaled[i], along, x[i])) for i in range(4))
@@ -153,40 +152,81 @@ def _shifted(matrix: Symmetric4, shift: Tensor) -> Symmetric4:
     return m00 - shift, m01, m02, m03, m11 - shift, m12, m13, m22 - shift, m23, m33 - shift
 
 
-_Factors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+class _Factors(NamedTuple):
+    """LDL^T, unit lower triangular L.
+
+    Attributes:
+        i0: inverse pivot 0, and so on.
+        i1: ...
+        i2: ...
+        d3: the last pivot, which may vanish.
+        s0: the last pivot by pivot 0, and so on.
+        s1: ...
+        s2: ...
+        l10: row 1, column 0 of L, and so on.
+        l20: ...
+        l30: ...
+        l21: ...
+        l31: ...
+        l32: ...
+    """
+
+    i0: Tensor
+    i1: Tensor
+    i2: Tensor
+    d3: Tensor
+    s0: Tensor
+    s1: Tensor
+    s2: Tensor
+    l10: Tensor
+    l20: Tensor
+    l30: Tensor
+    l21: Tensor
+    l31: Tensor
+    l32: Tensor
 
 
 def _factor(matrix: Symmetric4) -> _Factors:
-    """LDL^T: inverse pivots 0..2, the last pivot, and l10 l20 l30 l21 l31 l32."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
-    i0 = 1 / m00
+    i0 = m00.reciprocal()
     l10, l20, l30 = m01 * i0, m02 * i0, m03 * i0
-    i1 = 1 / _less(m11, l10, m01)
+    i1 = _less(m11, l10, m01).reciprocal()
     t21, t31 = _less(m12, l20, m01), _less(m13, l30, m01)
     l21, l31 = t21 * i1, t31 * i1
-    i2 = 1 / _less(_less(m22, l20, m02), l21, t21)
+    i2 = _less(_less(m22, l20, m02), l21, t21).reciprocal()
     t32 = _less(_less(m23, l30, m02), l31, t21)
     l32 = t32 * i2
     d3 = _less(_less(_less(m33, l30, m03), l31, t31), l32, t32)
-    return i0, i1, i2, d3, l10, l20, l30, l21, l31, l32
+    return _Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, l10, l20, l30, l21, l31, l32)
 
 
-def _solve_scaled(factors: _Factors, b: Vector4) -> Vector4:
+def _solve_scaled(f: _Factors, b: Vector4) -> Vector4:
     """The last pivot times M^-1 b: the pivot that vanishes is never divided by."""
-    i0, i1, i2, d3, l10, l20, l30, l21, l31, l32 = factors
     b0, b1, b2, b3 = b
-    b1 = _less(b1, l10, b0)
-    b2 = _less(_less(b2, l20, b0), l21, b1)
-    z3 = _less(_less(_less(b3, l30, b0), l31, b1), l32, b2)
-    z2 = _less(b2 * (i2 * d3), l32, z3)
-    z1 = _less(_less(b1 * (i1 * d3), l21, z2), l31, z3)
-    z0 = _less(_less(_less(b0 * (i0 * d3), l10, z1), l20, z2), l30, z3)
+    b1 = _less(b1, f.l10, b0)
+    b2 = _less(_less(b2, f.l20, b0), f.l21, b1)
+    b3 = _less(_less(_less(b3, f.l30, b0), f.l31, b1), f.l32, b2)
+    return _back(f, b0 * f.s0, b1 * f.s1, b2 * f.s2, b3)
+
+
+def _start(f: _Factors) -> Vector4:
+    """The same for a b of which L^-1 b is constant: nearly M^-1 e4, the inhomogeneous solution.
+
+    The other components reach vectors near infinity, to which e4 is nearly orthogonal.
+    """
+    return _back(f, 0.13 * f.s0, 0.07 * f.s1, 0.11 * f.s2, torch.ones_like(f.d3))
+
+
+def _back(f: _Factors, z0: Tensor, z1: Tensor, z2: Tensor, z3: Tensor) -> Vector4:
+    z2 = _less(z2, f.l32, z3)
+    z1 = _less(_less(z1, f.l21, z2), f.l31, z3)
+    z0 = _less(_less(_less(z0, f.l10, z1), f.l20, z2), f.l30, z3)
     return z0, z1, z2, z3
 
 
 def _quotient(factors: _Factors, x: Vector4, before: Vector4) -> Tensor:
     """x^T M x / x^T x for x = ``_solve_scaled(factors, before)``."""
-    return factors[3] * dot(x, before) / dot(x, x)
+    return factors.d3 * dot(x, before) / dot(x, x)
 
 
 def _solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) -> Vector4:

@@ -105,11 +105,13 @@ def weigh(
     largest = size.amax(dim=-2, keepdim=True)
     unused = size <= NEGLIGIBLE_WEIGHT * largest
     counted = largest <= torch.finfo(work).max  # NaN is not, either
+    one, zero = weight.new_ones(()), weight.new_zeros(())
+    largest = torch.where(counted & (largest > 0), largest, one)
     # Double where: an infinite weight must not turn the gradient into NaN.
-    share = torch.where(counted, weight, 0.0) / torch.where(counted & (largest > 0), largest, 1.0)
+    share = torch.where(counted, weight, zero) / largest
     return Weights(
-        squared=torch.where(sound & ~unused, share * share, 0.0),
-        largest=torch.where(counted & (largest > 0), largest, 1.0),
+        squared=torch.where(sound & ~unused, share * share, zero),
+        largest=largest,
         unused=unused,
         used=(~unused).to(work),
         sound=(sound | unused).all(dim=-2) & counted.squeeze(-2),
@@ -160,7 +162,7 @@ def observe(
     return Observations(
         proj=torch.where(finite[..., None, None], proj, 0.0).to(work),
         sick=(~finite).to(work),
-        xy=torch.where(sound.unsqueeze(-2), xy, 0.0),
+        xy=torch.where(sound.unsqueeze(-2), xy, xy.new_zeros(())),
         weights=weighed,
     )
 

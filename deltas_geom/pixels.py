@@ -56,8 +56,11 @@ def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
         tensor([-1.,  1.])
     """
     height, width = image_size
-    size = torch.tensor([width, height], device=pixels.device, dtype=pixels.dtype)
-    return (2 * pixels + 1) / size - 1
+    dtype = pixels.dtype if pixels.is_floating_point() else torch.get_default_dtype()
+    # Not torch.tensor, which copies numbers of the host to the device and waits for them.
+    slope = torch.linspace(2 / width, 2 / height, 2, device=pixels.device, dtype=dtype)
+    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=pixels.device, dtype=dtype)
+    return torch.addcmul(at_zero, pixels, slope)
 
 
 def resize_pixels(

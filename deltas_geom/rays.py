@@ -28,6 +28,7 @@ from deltas_geom.rig_frame import (
     RigFrame,
     derivable_points,
     find_points,
+    in_world,
     judge_points,
     kept,
     rig_frames,
@@ -221,7 +222,7 @@ def _find(posed: _Posed) -> tuple[FoundPoints, Tensor]:
     polish = 2 if posed.dtype == torch.float64 else 0
     eps = torch.finfo(posed.dtype).eps
     found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = kept(found.points, posed.around, found.near)
+    x, y, z = in_world(found.points, posed.around)
     along = _along(posed.seen, (x, y, z))
     # At a camera's centre, within rounding, a point has no angle.
     size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()).unsqueeze(-2)

@@ -114,6 +114,7 @@ class _Traced(torch.autograd.Function):
         ctx.function = function
         ctx.save_for_backward(*tensors)
         outputs = values(*tensors)
+        ctx.floating = tuple(out.is_floating_point() for out in outputs)
         ctx.mark_non_differentiable(*(out for out in outputs if not out.is_floating_point()))
         return outputs
 
@@ -130,6 +131,6 @@ class _Traced(torch.autograd.Function):
             return tuple(out for out in function(*inputs) if out.is_floating_point())
 
         _, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
-        followed = tuple(g for g in gradients if g is not None)
+        followed = tuple(g for g, has in zip(gradients, ctx.floating, strict=True) if has)
         found = dict(zip(places, pull(followed), strict=True))
         return (None, None, *(found.get(k) for k in range(len(tensors))))

@@ -1,23 +1,26 @@
 """Gauss-Newton on the reprojection error of given points, with robust losses.
 
-A step is the normal matrix of triangulation at the projected pixels and a 3x3 solve. From the
-triangulated points of the rig frame one step is enough for all but gross outliers.
+A step is triangulation's normal matrix at the projected pixels and a 3x3 solve. From points
+triangulated in the rig frame one step is enough for all but gross outliers.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.homogeneous import safe_divide
-from deltas_geom.observations import solver_dtype
+from deltas_geom.chunks import in_chunks
+from deltas_geom.normal_matrix import Symmetric3, normal_matrix, second_derivative, solve3_scaled
+from deltas_geom.observations import Observations, Vector3, check_weights, observe, over_views
 
 Loss = Literal["squared", "huber", "cauchy"]
 
-_CHUNK, _SMALLEST_CHUNK = 8192, 1024  # points: what lies between stays in the cache
+_Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+_End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
 _FARTHEST = 1e10  # px: a projection farther out than this is as good as behind the camera
-_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 class Refined(NamedTuple):
@@ -47,14 +50,20 @@ def refine_points(
     steps: int = 1,
     loss: Loss = "squared",
     scale: float = 1.0,
+    gradient: Literal["unrolled", "implicit"] = "unrolled",
 ) -> Refined:
     r"""Move points so that their projections come closer to the pixels.
 
     Gauss-Newton on :math:`\sum_v w_v^2 \rho(\|e_v\|^2)`, e the distance in pixels. A robust loss
     re-weights the views at each step (iteratively re-weighted least squares). A step is taken
     only where this cost does not grow by more than rounding and the point stays in front of all
-    used views; elsewhere the point is kept. Gradients are those of the steps, unrolled; they
-    also reach the ``points`` given.
+    used views; elsewhere the point is kept.
+
+    Gradients: "unrolled" are those of the steps taken, however few; they also reach the
+    ``points`` given, and cost as much as the steps. "implicit" are those of the optimum, by the
+    implicit function theorem: at the cost of one step, without the lag with which unrolled ones
+    follow a robust loss, but right only where the points have converged, of first order alone,
+    and 0 for the ``points`` given. Take "unrolled" for a step or two, "implicit" for many.
 
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
@@ -66,17 +75,17 @@ def refine_points(
         steps: of Gauss-Newton. 0 judges the points without moving them.
         loss: "squared", "huber" (linear beyond ``scale``) or "cauchy" (logarithmic).
         scale: px, the distance of a view at which a robust loss begins to doubt it.
+        gradient: values do not depend on it. "implicit" is 0 where there is no strict minimum.
 
     Returns:
-        Points, residual and whether they could be refined. Nothing raises or turns NaN because
-        of values.
+        Points, residual, could they be refined? Nothing raises or turns NaN because of values.
 
     Raises:
         ShapeError: a trailing shape differs.
-        ValueError: an unknown loss, a negative number of steps, a scale that is not positive.
+        ValueError: unknown loss or gradient, negative number of steps, scale not positive.
 
-    Source: Hartley and Zisserman, 2nd ed., appendix 6; Triggs et al., Bundle Adjustment: A
-    Modern Synthesis (2000), section 4.3.
+    Source: Hartley and Zisserman, 2nd ed., appendix 6, and section 5.2.6 (implicit functions);
+    Triggs et al., Bundle Adjustment: A Modern Synthesis (2000), section 4.3.
 
     Example:
         >>> left = torch.tensor([[100.0, 0, 50, 0], [0, 100, 40, 0], [0, 0, 1, 0]])
@@ -89,268 +98,203 @@ def refine_points(
         tensor([[0.2000, 0.1000, 2.0000]])
     """
     check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    if weights is not None:
-        check_shapes(weights=(weights, "V N"), pixels=(pixels, "V N 2"))
-    if mask is not None:
-        check_shapes(mask=(mask, "V N"), pixels=(pixels, "V N 2"))
+    batch = batch_shape(proj.shape[:-3], points.shape[:-2])
+    check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
     if loss not in ("squared", "huber", "cauchy"):
         raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy', got {loss!r}")
+    if gradient not in ("unrolled", "implicit"):
+        raise ValueError(f"gradient must be 'unrolled' or 'implicit', got {gradient!r}")
     if steps < 0:
         raise ValueError(f"steps must not be negative, got {steps}")
     if not scale > 0:
         raise ValueError(f"scale must be positive, got {scale}")
+    robust = partial(_robust, loss, scale)
 
-    count = pixels.shape[-2]
-    chunk = max(_SMALLEST_CHUNK, _CHUNK // max(1, pixels.shape[:-3].numel()))
-    parts = []
-    for first in range(0, max(count, 1), chunk):
-        some = slice(first, first + chunk)
-        observed = _observe(
-            proj,
-            pixels[..., some, :],
-            points[..., some, :],
-            None if weights is None else weights[..., some],
-            None if mask is None else mask[..., some],
-        )
-        parts.append(_refine(observed, points[..., some, :], steps, loss, scale))
-    if len(parts) == 1:
-        return parts[0]
-    found, residual, valid = zip(*parts, strict=True)
-    return Refined(torch.cat(found, dim=-2), torch.cat(residual, dim=-1), torch.cat(valid, dim=-1))
+    def unrolled(*inputs: Tensor) -> tuple[Tensor, ...]:
+        problem = _pose(robust, *inputs)
+        return _outward(problem, *_descend(problem, steps), dtype=points.dtype)
+
+    def implicit(*inputs: Tensor) -> tuple[Tensor, ...]:
+        problem = _pose(robust, *inputs)
+        with torch.no_grad():
+            end = _descend(problem, steps)
+        return _outward(problem, *_with_implicit_gradient(problem, end), dtype=points.dtype)
+
+    derivable = unrolled if gradient == "unrolled" else implicit
+    known = ((pixels, -2), (points, -2), (weights, -1), (mask, -1))
+    return Refined(*in_chunks(derivable, unrolled, proj, known, dims=(-2, -1, -1)))
 
 
-class _Observations(NamedTuple):
-    """The inputs in the solver's type, broadcast, with everything unusable replaced.
+def _robust(loss: Loss, scale: float, squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """rho of squared distances s, px^2 (near 0 it is s), its influence rho', and 2 rho''."""
+    if loss == "squared":
+        return squared, squared.new_ones(()), squared.new_zeros(())
+    ratio = squared / scale**2
+    if loss == "cauchy":
+        slope = 1 / (1 + ratio)
+        return scale**2 * ratio.log1p(), slope, -2 * slope.square() / scale**2
+    far, slope = ratio > 1, ratio.clamp(min=1).rsqrt()
+    rho = torch.where(far, scale**2 * (2 / slope - 1), squared)
+    return rho, slope, torch.where(far, slope**3 / -(scale**2), 0.0)
+
+
+class _Problem(NamedTuple):
+    """What is to be minimised, and from where.
 
     Attributes:
-        directions: ``(*B, V, 3, 3)`` left part of the cameras.
-        positions: ``(*B, V, 3, 1)`` their last column.
-        x: ``(*B, V, N)`` px, 0 where unused.
-        y: ``(*B, V, N)``.
-        points: ``(*B, 3, N)``, 0 where not finite.
-        squared: ``(*B, V, N)`` squared weights, largest 1; 0 where unused.
-        used: ``(*B, V, N)`` of points that can be refined.
-        valid: ``(*B, N)`` finite and two or more views are used.
+        observed: cameras, pixels and weights.
+        robust: the loss, see :func:`_robust`.
+        start: ``(*B, 3, N)`` m; 0 where not finite.
+        sound: ``(*B, N)`` bool: finite, and two or more views are used.
+        limit: m, where points stop to be representable.
     """
 
-    directions: Tensor
-    positions: Tensor
-    x: Tensor
-    y: Tensor
-    points: Tensor
-    squared: Tensor
-    used: Tensor
-    valid: Tensor
+    observed: Observations
+    robust: _Loss
+    start: Tensor
+    sound: Tensor
+    limit: float
 
 
-def _observe(
-    proj: Tensor, pixels: Tensor, points: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> _Observations:
-    work = solver_dtype(proj)
-    weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    if mask is not None:
-        weight = torch.where(mask, weight, 0.0)
-    batch = batch_shape(proj.shape[:-3], pixels.shape[:-3], points.shape[:-2], weight.shape[:-2])
-    weight = weight.to(work).expand(*batch, *weight.shape[-2:])
-    camera, x, y = proj.to(work), *pixels.to(work).unbind(dim=-1)
-    start = points.to(work).mT.expand(*batch, 3, points.shape[-2])
-
-    # NaN is not let through either.
-    limit = _limit(proj.dtype, work)
-    known_camera = (camera.abs() < limit).all(-1).all(-1)[..., None]
-    used = weight != 0  # NaN counts as used, and is caught as not finite
-    known = (x.abs() < limit) & (y.abs() < limit) & weight.isfinite() & known_camera
-    known_start = (start.abs() < limit).all(dim=-2)
-    valid = (known | ~used).all(dim=-2) & known_start & (used.sum(dim=-2) >= 2)
-    used = used & valid.unsqueeze(-2)
-    largest = torch.where(used, weight.detach().abs(), 0.0).amax(dim=-2, keepdim=True)
-    share = weight / torch.where(largest > 0, largest, 1.0)
-    # Double where throughout: what is not used must pass no gradient and no NaN.
-    camera = torch.where(known_camera[..., None], camera, 0.0)
-    return _Observations(
-        directions=camera[..., :3],
-        positions=camera[..., 3:],
-        x=torch.where(used, x, 0.0),
-        y=torch.where(used, y, 0.0),
-        points=torch.where(known_start.unsqueeze(-2), start, 0.0),
-        squared=torch.where(used, share, 0.0).square(),
-        used=used,
-        valid=valid,
-    )
-
-
-def _limit(given: torch.dtype, work: torch.dtype) -> float:
-    """What is beyond counts as not finite: products of four, or a sum of two, overflow."""
-    widest: float = torch.finfo(work).max ** 0.25
-    return min(widest, torch.finfo(given).max / 4)
+def _pose(
+    robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Tensor | None
+) -> _Problem:
+    observed = observe(proj, pixels, *weighed)
+    place = points.mT.to(observed.xy.dtype, memory_format=torch.contiguous_format)
+    limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
+    finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
+    start = torch.where(finite.unsqueeze(-2), place, place.new_zeros(()))
+    # One sick view outweighs all that are used, so that one sum tells both.
+    counted = observed.weights.used * (1 - proj.shape[-3] * observed.sick).unsqueeze(-1)
+    sound = observed.weights.sound & finite & (counted.sum(dim=-2) >= 2)
+    return _Problem(observed, robust, start, sound, min(limit, torch.finfo(points.dtype).max))
 
 
 class _Fit(NamedTuple):
-    """Points and how they fit.
+    """Points as views see them.
 
     Attributes:
-        points: ``(*B, 3, N)``.
-        x: ``(*B, V, N)`` projection, px; 0 where unused.
-        y: ``(*B, V, N)``.
-        inverse: ``(*B, V, N)`` 1 / depth; 0 where unused.
-        distance: ``(*B, V, N)`` squared distance from the pixels, px^2.
-        cost: ``(*B, N)`` weighted sum of the loss, without gradient.
-        in_front: ``(*B, N)`` of all used views.
+        place: x and y ``(*B, V, N)`` px of the projections.
+        offset: x and y ``(*B, V, N)`` px, from the pixels to there.
+        inverse: ``(*B, V, N)`` 1 / depth.
+        influence: ``(*B, V, N)`` rho', or () if all alike.
+        bend: ``(*B, V, N)`` 2 rho'', or ().
+        error: ``(*B, N)`` px^2, weighted sum of the squared distances.
+        cost: ``(*B, N)`` px^2, of the loss, without gradient; infinite if not in front of all.
     """
 
-    points: Tensor
-    x: Tensor
-    y: Tensor
+    place: tuple[Tensor, Tensor]
+    offset: tuple[Tensor, Tensor]
     inverse: Tensor
-    distance: Tensor
+    influence: Tensor
+    bend: Tensor
+    error: Tensor
     cost: Tensor
-    in_front: Tensor
 
 
-def _fit(observed: _Observations, points: Tensor, loss: Loss, scale: float) -> _Fit:
-    homogeneous = observed.directions @ points.unsqueeze(-3) + observed.positions
-    x, y, z = homogeneous.unbind(dim=-2)
-    smallest = torch.finfo(z.dtype).tiny ** 0.25
+def _fit(problem: _Problem, points: Vector3) -> _Fit:
+    observed = problem.observed
+    rows = observed.proj.transpose(-3, -2).flatten(-3, -2)  # (*B, 3 V, 4)
+    homogeneous = rows @ torch.stack([*points, torch.ones_like(points[0])], dim=-2)
+    a, b, c = homogeneous.chunk(3, dim=-2)
     with torch.no_grad():
-        farthest = torch.maximum(x.abs(), y.abs())
-        seen = (z > smallest) & (farthest < _FARTHEST * z)
-        in_front = (seen | ~observed.used).all(dim=-2)
-    inverse = safe_divide(torch.ones_like(z), z, observed.used & seen)
-    x, y = x * inverse, y * inverse
-    distance = (x - observed.x).square() + (y - observed.y).square()
+        # Far enough from overflow for squares of all that is divided by the depth.
+        smallest = torch.finfo(c.dtype).tiny ** (1 / 6)
+        least = (torch.maximum(a.abs(), b.abs()) * (1 / _FARTHEST)).clamp(min=smallest)
+    depth = torch.maximum(c, least)
+    inverse, (px, py) = depth.reciprocal(), observed.xy.unbind(dim=-2)
+    x, y = a * inverse, b * inverse
+    dx, dy = x - px, y - py
+    distance = torch.addcmul(dx * dx, dy, dy)
+    error = (observed.weights.squared * distance).sum(dim=-2)
+    rho, influence, bend = problem.robust(distance)
     with torch.no_grad():
-        cost = (observed.squared * _loss(distance, loss, scale)).sum(dim=-2)
-    return _Fit(points, x, y, inverse, distance, cost, in_front)
+        behind = ((depth - c) * observed.weights.used).sum(dim=-2) > 0
+        cost = error if rho is distance else (observed.weights.squared * rho).sum(dim=-2)
+    cost = torch.where(behind, torch.inf, cost.detach())
+    return _Fit((x, y), (dx, dy), inverse, influence, bend, error, cost)
 
 
-def _loss(distance: Tensor, loss: Loss, scale: float) -> Tensor:
-    """The loss of squared distances, px^2; near 0 it is the squared distance itself."""
-    if loss == "squared":
-        return distance
-    ratio = distance / scale**2
-    if loss == "cauchy":
-        return scale**2 * ratio.log1p()
-    return scale**2 * torch.where(ratio > 1, 2 * ratio.sqrt() - 1, ratio)
-
-
-def _influence(distance: Tensor, loss: Loss, scale: float) -> Tensor:
-    """Derivative of the loss by the squared distance: the factor on a view's squared weight."""
-    if loss == "squared":
-        return torch.ones_like(distance)
-    ratio = distance / scale**2
-    if loss == "cauchy":
-        return 1 / (1 + ratio)
-    far = ratio > 1
-    return torch.where(far, torch.where(far, ratio, 1.0).rsqrt(), 1.0)
-
-
-def _refine(
-    observed: _Observations, given: Tensor, steps: int, loss: Loss, scale: float
-) -> Refined:
-    fit = _fit(observed, observed.points, loss, scale)
-    valid = observed.valid & fit.in_front
-    noise = _rounding(observed, fit)
+def _descend(problem: _Problem, steps: int) -> _End:
+    x, y, z = problem.start.unbind(dim=-2)
+    fit = _fit(problem, (x, y, z))
+    error, cost, valid = fit.error, fit.cost, problem.sound & (fit.cost < torch.inf)
+    noise, moving = _rounding(problem, fit), valid
     for step in range(steps):
-        change, determined = _step(observed, fit, _influence(fit.distance, loss, scale))
+        (dx, dy, dz), determined = solve3_scaled(*_normal_equations(problem, fit))
         if step == 0:
-            valid = valid & determined
-        limit = _limit(given.dtype, change.dtype)
-        near = ((fit.points + change).detach().abs() < limit).all(dim=-2)
-        usable = valid & determined & near
-        moved = fit.points + torch.where(usable.unsqueeze(-2), change, 0.0)
-        new = _fit(observed, moved, loss, scale)
+            moving = valid = valid & determined
+        nx, ny, nz = x + dx, y + dy, z + dz
+        near = nx.detach().abs() + ny.detach().abs() + nz.detach().abs() < problem.limit
+        moving = moving & determined & near
+        nx, ny, nz = (torch.where(moving, b, a) for a, b in ((x, nx), (y, ny), (z, nz)))
+        fit = _fit(problem, (nx, ny, nz))
         # Rounding must not refuse a step at the optimum, of which it carries the gradient.
-        highest = (fit.cost.sqrt() + noise).square()
-        accepted = usable & new.in_front & (new.cost <= highest)
-        merged = (
-            torch.where(accepted.unsqueeze(-2) if b.dim() > accepted.dim() else accepted, b, a)
-            for a, b in zip(fit, new, strict=True)
-        )
-        fit = _Fit(*merged)
-
-    # What failed keeps the caller's own digits, and no gradient.
-    kept = torch.where(given.isfinite().all(dim=-1, keepdim=True), given, 0.0).detach()
-    found = torch.where(valid[..., None], fit.points.mT.to(given.dtype), kept)
-    total = observed.squared.sum(dim=-2)
-    mean = safe_divide((observed.squared * fit.distance).sum(dim=-2), total, valid)
-    positive = valid & (mean > 0)
-    # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-    residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
-    return Refined(found, residual.to(given.dtype), valid)
+        rounded = cost * (1 + 32 * torch.finfo(cost.dtype).eps) + noise
+        # What is refused once would be refused again: from there the fit does not matter.
+        moving = moving & (fit.cost < torch.add(rounded, (cost * noise).sqrt(), alpha=2))
+        x, y, z = (torch.where(moving, b, a) for a, b in ((x, nx), (y, ny), (z, nz)))
+        error, cost = torch.where(moving, fit.error, error), torch.where(moving, fit.cost, cost)
+    return (x, y, z), error, valid
 
 
-def _rounding(observed: _Observations, fit: _Fit) -> Tensor:
-    """What rounding of the projections may add to the square root of the cost, ``(*B, N)``."""
-    with torch.no_grad():
-        size = observed.directions.abs() @ fit.points.abs().unsqueeze(-3)
-        size = (size + observed.positions.abs())[..., :2, :].amax(dim=-2) * fit.inverse
-        size = size + observed.x.abs() + observed.y.abs()
-        largest = (observed.squared.sqrt() * size).amax(dim=-2)
-        return 16 * torch.finfo(size.dtype).eps * (largest + fit.cost.sqrt())
+@torch.no_grad()
+def _rounding(problem: _Problem, fit: _Fit) -> Tensor:
+    """What rounding of the projections may cost a perfect match, ``(*B, N)`` px^2."""
+    by_depth = problem.observed.weights.squared * fit.inverse * fit.inverse
+    size = problem.observed.proj[..., :2, :].square().sum(dim=-2)  # of the rows
+    turned, shifted = size[..., :3].sum(dim=-1, keepdim=True), size[..., 3:]
+    reach = problem.start.square().sum(dim=-2, keepdim=True)
+    squared = (torch.addcmul(shifted, turned, reach) * by_depth).sum(dim=-2)
+    info = torch.finfo(squared.dtype)
+    return squared.mul((16 * info.eps) ** 2).add(info.tiny**0.5)
 
 
-def _step(observed: _Observations, fit: _Fit, influence: Tensor) -> tuple[Tensor, Tensor]:
-    """The Gauss-Newton step ``(*B, 3, N)``, and whether the views determine it ``(*B, N)``."""
-    p1, p2, p3 = observed.directions.unbind(dim=-2)
-    rows, columns = _UPPER
-
-    def outer(a: Tensor, b: Tensor) -> Tensor:
-        return (a[..., rows] * b[..., columns] + b[..., rows] * a[..., columns]) / 2
-
-    # As in triangulation: every entry is linear in (x^2 + y^2, x, y, 1), one matrix product.
-    coefficients = torch.stack(
-        [outer(p3, p3), -2 * outer(p3, p1), -2 * outer(p3, p2), outer(p1, p1) + outer(p2, p2)],
-        dim=-2,
-    )  # (*B, V, 4, 6)
-    x, y, inverse = fit.x, fit.y, fit.inverse
-    once = observed.squared * influence * inverse
-    twice = once * inverse
-    terms = torch.stack([(x * x + y * y) * twice, x * twice, y * twice, twice], dim=-2)
-    normal = coefficients.flatten(-3, -2).mT @ terms.flatten(-3, -2)
-    error_x, error_y = x - observed.x, y - observed.y
-    terms = torch.stack(
-        [-error_x * once, -error_y * once, (error_x * x + error_y * y) * once], dim=-2
-    )
-    right = observed.directions.flatten(-3, -2).mT @ terms.flatten(-3, -2)
-    return _solve3(normal, right)
+def _normal_equations(problem: _Problem, fit: _Fit) -> tuple[Symmetric3, Vector3]:
+    """J^T W^2 J and -J^T W^2 e of the re-weighted views, e the distances."""
+    directions, (x, y), (dx, dy) = problem.observed.proj[..., :3], fit.place, fit.offset
+    once = problem.observed.weights.squared * fit.influence * fit.inverse
+    # The derivative of a pixel by the point is its equations, divided by the depth.
+    m00, m01, m02, m11, m12, m22 = normal_matrix(directions, x, y, once * fit.inverse)
+    across, down = dx * once, dy * once
+    terms = torch.stack([across, down, torch.addcmul(across * x, down, y)], dim=-2)
+    rows = torch.cat([-directions[..., :2, :], directions[..., 2:, :]], dim=-2).flatten(-3, -2)
+    r0, r1, r2 = over_views(rows.mT, terms.flatten(-3, -2))
+    return (m00, m01, m02, m11, m12, m22), (r0, r1, r2)
 
 
-def _solve3(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve symmetric 3x3 systems by LDL; 0 with zero gradient where not definite.
+def _with_implicit_gradient(problem: _Problem, end: _End) -> _End:
+    """The same, with the derivatives of the point at which the cost's gradient g is 0.
 
-    Args:
-        normal: ``(*B, 6, N)`` upper triangles, row by row.
-        right: ``(*B, 3, N)``.
-
-    Returns:
-        ``(*B, 3, N)``, and whether the matrix is definite beyond rounding ``(*B, N)``.
+    They are -H^-1 dg with the cost's whole second derivative H. Gauss-Newton's normal matrix,
+    which leaves out how residuals and losses bend, would be wrong by their share.
     """
-    eps = torch.finfo(normal.dtype).eps
-    trace = (normal[..., 0, :] + normal[..., 3, :] + normal[..., 5, :]).detach()
-    limit = torch.finfo(trace.dtype).max ** 0.5
-    ordinary = (trace > 1 / limit) & (trace < limit)
-    ordinary = ordinary & (right.detach().abs() < limit).all(dim=-2)
-    share = torch.where(ordinary, 1 / torch.where(ordinary, trace, 1.0), 0.0)
-    where = ordinary.unsqueeze(-2)
-    a00, a01, a02, a11, a12, a22 = torch.where(
-        where, normal * share.unsqueeze(-2), normal.new_tensor([1, 0, 0, 1, 0, 1.0])[:, None]
-    ).unbind(dim=-2)
-    b0, b1, b2 = torch.where(where, right * share.unsqueeze(-2), 0.0).unbind(dim=-2)
+    (x, y, z), valid = (component.detach() for component in end[0]), end[2]
+    fit = _fit(problem, (x, y, z))
+    normal, right = _normal_equations(problem, fit)
+    seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
+    with torch.no_grad():
+        counted = squared * fit.influence, squared * fit.bend
+        hessian = second_derivative(normal, problem.observed.proj, *seen, *counted)
+    h00, h01, h02, h11, h12, h22 = (entry.detach() for entry in hessian)
+    change, strict = solve3_scaled((h00, h01, h02, h11, h12, h22), right)
+    px, py, pz = (
+        # A gradient of 0 to the start, not a missing one; of the step no value.
+        p + 0 * s + torch.where(strict & valid, d - d.detach(), 0.0)
+        for p, s, d in zip((x, y, z), problem.start.unbind(dim=-2), change, strict=True)
+    )
+    return (px, py, pz), _fit(problem, (px, py, pz)).error, valid
 
-    def reciprocal(pivot: Tensor) -> tuple[Tensor, Tensor]:
-        definite = pivot > 64 * eps
-        return 1 / torch.where(definite, pivot, 1.0), definite
 
-    i0, definite0 = reciprocal(a00)
-    l10, l20 = a01 * i0, a02 * i0
-    i1, definite1 = reciprocal(a11 - l10 * a01)
-    t = a12 - l20 * a01
-    l21 = t * i1
-    i2, definite2 = reciprocal(a22 - l20 * a02 - l21 * t)
-    b1 = b1 - l10 * b0
-    z2 = (b2 - l20 * b0 - l21 * b1) * i2
-    z1 = b1 * i1 - l21 * z2
-    z0 = b0 * i0 - l10 * z1 - l20 * z2
-    definite = ordinary & definite0 & definite1 & definite2
-    solution = torch.stack([z0, z1, z2], dim=-2)
-    return torch.where(definite.unsqueeze(-2), solution, 0.0), definite
+def _outward(
+    problem: _Problem, points: Vector3, error: Tensor, valid: Tensor, *, dtype: torch.dtype
+) -> tuple[Tensor, ...]:
+    # What failed keeps the caller's own digits, and no gradient.
+    kept, total = problem.start.detach(), problem.observed.weights.squared.sum(dim=-2)
+    found = torch.where(valid.unsqueeze(-2), torch.stack(points, dim=-2), kept).mT
+    positive = valid & (error > 0)
+    # The largest squared weight is 1: less is no view. sqrt has an infinite slope at a perfect
+    # match; its gradient there is taken as 0.
+    root = (torch.where(positive, error, 1.0) / total.clamp(min=1)).sqrt()
+    residual = torch.where(positive, root, 0.0).clamp(max=torch.finfo(dtype).max)
+    return found.to(dtype, memory_format=torch.contiguous_format), residual.to(dtype), valid

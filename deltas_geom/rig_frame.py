@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import safe_divide
 from deltas_geom.null_vector import (
     Symmetric4,
     Vector4,
@@ -96,12 +95,13 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         eps: rounding of the inputs, relative.
     """
     total, square, x, y, z = weighted
-    inverse = safe_divide(torch.ones_like(total), total, total.detach() > 0)
+    # The largest squared weight is 1: less is no view, and its sums are 0.
+    inverse = total.clamp(min=1).reciprocal()
     origin = (x * inverse, y * inverse, z * inverse)
     spread = square * inverse - _squared_length(origin)
     with torch.no_grad():
         count, size, mx, my, mz, from_world, sick = counted
-        share = 1 / count.clamp(min=1)
+        share = count.clamp(min=1).reciprocal()
         size, middle = size * share, (mx * share, my * share, mz * share)
         reach = size - _squared_length(middle)
         # Centres closer together than the rounding of where they are do not differ.
@@ -132,7 +132,7 @@ def in_frame(normal: Symmetric4, origin: Vector3, length: Tensor) -> Symmetric4:
 
     n03, n13, n23 = moved(m03, m00, m01, m02), moved(m13, m01, m11, m12), moved(m23, m02, m12, m22)
     n33 = moved(moved(m33, m03, m13, m23), n03, n13, n23)
-    inverse = 1 / length
+    inverse = length.reciprocal()
     return (
         m00, m01, m02, n03 * inverse,
         m11, m12, n13 * inverse,
@@ -218,6 +218,12 @@ def derivable_points(
     return _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
 
 
+def in_world(points: Vector3, around: Tensor) -> Vector3:
+    """Points in the world, from points relative to the origin of the sums ``(*B, 1, 3)``."""
+    (x, y, z), (ox, oy, oz) = points, around.unbind(dim=-1)
+    return x + ox, y + oy, z + oz
+
+
 def kept(points: Vector3, around: Tensor, valid: Tensor) -> Vector3:
     """The valid points in the world, the others 0.
 
@@ -226,10 +232,8 @@ def kept(points: Vector3, around: Tensor, valid: Tensor) -> Vector3:
         around: ``(*B, 1, 3)`` the origin of the sums.
         valid: ``(*B, N)`` bool.
     """
-    x, y, z = (
-        torch.where(valid, component + middle, 0.0)
-        for component, middle in zip(points, around.unbind(dim=-1), strict=True)
-    )
+    zero = around.new_zeros(())
+    x, y, z = (torch.where(valid, component, zero) for component in in_world(points, around))
     return x, y, z
 
 

@@ -96,7 +96,7 @@ def sample_inv_depths(
 
     Returns:
         Samples with O = 1. Where a sample falls behind a source or outside its image the mask
-        is False; behind, its pixel is (0, 0).
+        is False; behind, its pixel is (0, 0). In front is as in :func:`epipolar_segments`.
 
     Raises:
         ShapeError: a trailing shape differs.
@@ -107,8 +107,8 @@ def sample_inv_depths(
     inv_depth = inv_depths.unsqueeze(-3) if inv_depths.ndim > 1 else inv_depths
     inv_depth = inv_depth.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depth.shape))
     homogeneous = rays.at(inv_depth)
-    noise = 64 * torch.finfo(homogeneous.dtype).eps * rays.origin.abs().amax(-1)[..., None]
-    in_front = (homogeneous[..., 2] > noise) & rays.finite[..., None]
+    least = rays.clearance[..., None] + inv_depth.detach().abs() * rays.clearance_slope[..., None]
+    in_front = (homogeneous[..., 2] > least) & rays.finite[..., None]
     where = safe_divide(homogeneous[..., :2], homogeneous[..., 2:], in_front[..., None])
     mask = in_front & in_image(where, image_size=image_size)
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
@@ -117,6 +117,9 @@ def sample_inv_depths(
 def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     """Read a feature map of any stride at pixels of the image, bilinearly.
 
+    Arithmetic is in float32 at least, whatever the map's dtype and ``torch.autocast`` say: in
+    bfloat16 places in an image of 640 px are known to a pixel or two.
+
     Args:
         feature_map: ``(*B, D, h, w)``, the image plane sampled coarser.
         pixels: ``(*B, N, 2)`` in the image; beyond the map's outer centres its border is
@@ -124,7 +127,9 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
         image_size: (height, width) of the image.
 
     Returns:
-        ``(*B, N, D)``.
+        ``(*B, N, D)`` in the map's dtype, at least float32. A coordinate that is NaN or infinite
+        reads the border, NaN and minus infinity the left or upper one, with zero gradient to the
+        pixel.
 
     Raises:
         ShapeError: a trailing shape differs.
@@ -139,7 +144,19 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
     # The count, not -1: a reshape of no keypoints cannot infer it.
     count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]
     maps = feature_map.expand(*batch, *size).reshape(count, *size)
-    grid = normalize_pixels(pixels, image_size=image_size).to(feature_map.dtype)
-    grid = grid.expand(*batch, num, 2).reshape(count, 1, num, 2)
-    read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+    grid = _grid(pixels, image_size=image_size).expand(*batch, num, 2).reshape(count, 1, num, 2)
+    dtype = torch.promote_types(maps.dtype, torch.float32)
+    read = F.grid_sample(maps.to(dtype), grid.to(dtype), padding_mode="border", align_corners=False)
     return read.squeeze(-2).mT.reshape(*batch, num, size[0])
+
+
+def _grid(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
+    """Pixels ``(*B, 2)`` as coordinates that `grid_sample` survives, in float32 at least.
+
+    The backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU). Here
+    NaN is the border; what is not finite passes no gradient.
+    """
+    wide = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
+    return normalize_pixels(wide, image_size=image_size).nan_to_num(
+        nan=-1.0, posinf=1.0, neginf=-1.0
+    )

@@ -11,11 +11,18 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_depth_range, check_image_size, check_shapes
-from deltas_geom.homogeneous import safe_divide
+from deltas_geom.fundamental import inverse_intrinsics
+from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
 from deltas_geom.projection import pixel_rays
 from deltas_geom.status import Status
 from deltas_geom.views import PosedViews
+
+# A point counts as in front of the source if it lies before its plane by more than this power of
+# eps times its distance from the anchor plus the baseline. On the plane a pixel is a quotient of
+# roundings; before it they are at most eps^-1/3 times those of a point far from it.
+_CLEARANCE = 1 / 3
+_ROUNDINGS = 4  # of eps times the terms of an epipolar ray; drawn rigs show less than 1
 
 
 class EpipolarRays(NamedTuple):
@@ -25,11 +32,21 @@ class EpipolarRays(NamedTuple):
         origin: ``(*B, V-1, N, 3)`` homogeneous source pixel of the point at infinity.
         slope: ``(*B, V-1, 1, 3)`` K t, the homogeneous epipole, pixels times metres.
         finite: ``(*B, 1, N)`` bool: the keypoint is finite; if not, (0, 0) stands in for it.
+        clearance: ``(*B, 1, N)``, and with inverse depth it grows by ``clearance_slope``: the
+            homogeneous depth from which a point counts as in front. Without gradient.
+        clearance_slope: ``(*B, V-1, 1)`` metres.
+        terms: ``(*B, V-1, N, 3)`` sums of the absolute terms of ``origin``, to whose rounding
+            its own is proportional. Without gradient.
+        slope_terms: ``(*B, V-1, 1, 3)`` the same of ``slope``.
     """
 
     origin: Tensor
     slope: Tensor
     finite: Tensor
+    clearance: Tensor
+    clearance_slope: Tensor
+    terms: Tensor
+    slope_terms: Tensor
 
     def at(self, inv_depth: Tensor) -> Tensor:
         """Homogeneous source pixels ``(*B, V-1, N, S, 3)`` at ``(*B, V-1, N, S)`` 1/m."""
@@ -44,9 +61,10 @@ class Segments(NamedTuple):
         end: ``(*B, V-1, N, 2)`` pixel of the near end.
         inv_depth_start: ``(*B, V-1, N)`` inverse of the anchor's z at the far end, 1/m.
         inv_depth_end: ``(*B, V-1, N)`` the same at the near end.
-        status: ``(*B, V-1, N)`` int8 of :class:`Status`: OK; NO_PARALLAX where the segment
-            is a point; EMPTY where nothing of the range is visible and NOT_FINITE_INPUT where
-            the keypoint is not finite (ends and inverse depths are then 0, with zero gradient).
+        status: ``(*B, V-1, N)`` int8 of :class:`Status`: OK; NO_PARALLAX where the segment is a
+            point (``end`` is then ``start``, whatever the inverse depths); EMPTY where nothing of
+            the range is visible and NOT_FINITE_INPUT where the keypoint is not finite (ends and
+            inverse depths are then 0, with zero gradient).
         foreshortening: ``(*B, V-1, N)`` homogeneous depth at the near end over that at the
             far end; it tells how inverse depth runs between the two ends.
     """
@@ -61,7 +79,7 @@ class Segments(NamedTuple):
     @property
     def visible(self) -> Tensor:
         """``(*B, V-1, N)`` bool: there is something to sample."""
-        return (self.status == Status.OK) | (self.status == Status.NO_PARALLAX)
+        return (self.status == Status.OK.value) | (self.status == Status.NO_PARALLAX.value)
 
 
 def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
@@ -80,9 +98,29 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     # A NaN would reach the gradient of every camera through the products below.
     known = torch.where(finite[..., None], pixels, 0.0)
     rays = pixel_rays(views.K[..., 0, :, :], known).unsqueeze(-3)
+    translation = source_from_anchor[..., :3, 3:]
     origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
-    slope = (K_source @ source_from_anchor[..., :3, 3:]).mT
-    return EpipolarRays(origin, slope, finite.unsqueeze(-2))
+    slope = (K_source @ translation).mT
+    with torch.no_grad():
+        share = torch.finfo(origin.dtype).eps ** _CLEARANCE
+        clearance = share * rays.abs().amax(dim=-1)
+        clearance_slope = share * translation.abs().amax(dim=-2)
+        poses = views.cam_from_world.abs()
+        to_source = views.K[..., 1:, :, :].abs() @ poses[..., 1:, :3, :3]
+        from_anchor = poses[..., :1, :3, :3].mT
+        homography = to_source @ from_anchor @ inverse_intrinsics(views.K[..., :1, :, :]).abs()
+        terms = to_homogeneous(known.abs()).unsqueeze(-3) @ homography.mT
+        slope_terms = to_source @ from_anchor @ poses[..., :1, :3, 3:]
+        slope_terms = slope_terms + views.K[..., 1:, :, :].abs() @ poses[..., 1:, :3, 3:]
+    return EpipolarRays(
+        origin,
+        slope,
+        finite.unsqueeze(-2),
+        clearance,
+        clearance_slope,
+        terms,
+        slope_terms.mT,
+    )
 
 
 def epipolar_segments(
@@ -102,7 +140,11 @@ def epipolar_segments(
 
     Returns:
         Segments that are exactly the visible part: every depth of the range that is visible
-        lies on them, none outside.
+        lies on them, none outside. In front of the source is what lies before its plane by more
+        than eps^1/3 of the distance from the anchor plus the baseline (6e-6 in float64, 5e-3 in
+        float32): nearer, pixels are quotients of roundings. A keypoint within rounding of the
+        epipole has a point and NO_PARALLAX, however far the range runs past the source; in
+        float32 that rounding is smaller if the world's origin is near the cameras.
 
     Raises:
         ShapeError: a trailing shape differs.
@@ -132,8 +174,10 @@ def epipolar_segments(
     )
     constant, growth = origin @ rows.mT, slope @ rows.mT
     # In front by more than rounding, so that the division by depth below is safe.
-    margin = 64 * torch.finfo(origin.dtype).eps * (origin.abs() + slope.abs() / near).amax(-1)
-    constant = torch.cat([constant[..., :1] - margin[..., None], constant[..., 1:]], dim=-1)
+    depth, other = constant[..., :1] - rays.clearance[..., None], constant[..., 1:]
+    constant = torch.cat([depth, other], dim=-1)
+    depth, other = growth[..., :1] - rays.clearance_slope[..., None], growth[..., 1:]
+    growth = torch.cat([depth, other], dim=-1)
 
     moving = growth != 0
     crossing = safe_divide(-constant, growth, moving)
@@ -148,12 +192,29 @@ def epipolar_segments(
     ends = rays.at(torch.stack([low, high], dim=-1))
     end_pixels = safe_divide(ends[..., :2], ends[..., 2:], visible[..., None, None])
     start, end = end_pixels.unbind(dim=-2)
+    still = _stands_still(rays)
+    # Where the pixel stands still, the end that lies farther before the source says best where.
+    farther = (ends[..., 0, 2] >= ends[..., 1, 2])[..., None]
+    point = torch.where(farther, start, end)
+    start, end = (torch.where(still[..., None], point, x) for x in (start, end))
     length = (end - start).abs().amax(dim=-1)
-    a_point = length <= 16 * torch.finfo(length.dtype).eps * max(height, width)
-    status = torch.where(a_point, Status.NO_PARALLAX, Status.OK)
-    status = torch.where(visible, status, Status.EMPTY)
-    status = torch.where(rays.finite, status, Status.NOT_FINITE_INPUT).to(torch.int8)
+    a_point = still | (length <= 16 * torch.finfo(length.dtype).eps * max(height, width))
+    status = torch.where(a_point, Status.NO_PARALLAX.value, Status.OK.value)
+    status = torch.where(visible, status, Status.EMPTY.value)
+    status = torch.where(rays.finite, status, Status.NOT_FINITE_INPUT.value).to(torch.int8)
     foreshortening = torch.where(
         visible, safe_divide(ends[..., 1, 2], ends[..., 0, 2], visible), 1.0
     )
     return Segments(start, end, low, high, status, foreshortening)
+
+
+@torch.no_grad()
+def _stands_still(rays: EpipolarRays) -> Tensor:
+    """Whether pixels move with inverse depth by rounding alone, ``(*B, V-1, N)`` bool."""
+    o, s, a, b = rays.origin, rays.slope, rays.terms, rays.slope_terms
+    # A pixel's derivative by inverse depth is this, divided by its squared homogeneous depth.
+    moved = s[..., :2] * o[..., 2:] - o[..., :2] * s[..., 2:]
+    noise = b[..., :2] * a[..., 2:] + a[..., :2] * b[..., 2:]
+    eps = torch.finfo(moved.dtype).eps
+    still: Tensor = (moved.abs() <= _ROUNDINGS * eps * noise).all(dim=-1)
+    return still

@@ -25,6 +25,7 @@ from deltas_geom.rig_frame import (
     camera_moments,
     derivable_points,
     find_points,
+    in_world,
     judge_points,
     kept,
     rig_frame,
@@ -309,7 +310,7 @@ def _find(posed: _Posed) -> tuple[FoundPoints, Tensor]:
     polish = 2 if posed.dtype == torch.float64 else 0
     eps = torch.finfo(posed.dtype).eps
     found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = kept(found.points, posed.around, found.near)
+    x, y, z = in_world(found.points, posed.around)
     _, _, depth = _project(listed.camera, _at(torch.stack([x, y, z]), listed.point))
     behind = _sum((~listed.unused & ~(depth > 0)).to(depth.dtype), listed.point, count)
     held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max

@@ -25,6 +25,7 @@ from deltas_geom.rig_frame import (
     derivable_points,
     find_points,
     in_frame,
+    in_world,
     judge_points,
     kept,
     rig_frames,
@@ -238,7 +239,7 @@ def _find(posed: _Posed, frame: str) -> tuple[FoundPoints, Tensor]:
         polish = _POLISH[frame]
     eps = torch.finfo(posed.dtype).eps
     found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = kept(found.points, posed.around, found.near)
+    x, y, z = in_world(found.points, posed.around)
     # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
     depth = in_views(posed.observed.proj[..., 2, :], (x, y, z))
     in_front = torch.where(posed.observed.weights.unused, 1.0, depth).amin(dim=-2) > 0

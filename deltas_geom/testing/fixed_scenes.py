@@ -142,12 +142,7 @@ _POSED = (
 )
 _SEGMENTS = (
     *_POSED[:5],
-    # Not on_baseline: its ray runs through the source's centre, where an end has no pixel.
-    *(
-        partial(DEGENERATE_SCENES[name], dtype=torch.float64)
-        for name in DEGENERATE_SCENES
-        if name != "on_baseline"
-    ),
+    *(partial(make, dtype=torch.float64) for make in DEGENERATE_SCENES.values()),
     partial(seeded_scene, 2, num_points=9, skew=5.0),
 )
 _MAPS = (

@@ -14,6 +14,7 @@ from deltas_geom.views import PosedViews
 
 VISIBLE = (Status.OK, Status.NO_PARALLAX)
 """What a segment's mask calls True."""
+PLANE_TOLERANCE = 1e-4  # of the depths whose difference is a point's depth in view 1
 
 
 class Sights(NamedTuple):
@@ -36,6 +37,11 @@ class Sights(NamedTuple):
         homogeneous = self.at(inv_depth)
         pixels = homogeneous[..., :2] / homogeneous[..., 2:]
         return pixels, (homogeneous[..., 2] > 0) & in_image(pixels, image_size=image_size)
+
+    def on_plane(self, inv_depth: Tensor) -> Tensor:
+        """Whether a depth is so close to view 1's plane that its pixel is rounding, ``(N, S)``."""
+        size = self.far[:, None, 2].abs() + inv_depth.abs() * self.toward[:, None, 2].abs()
+        return self.at(inv_depth)[..., 2].abs() < PLANE_TOLERANCE * size
 
     def inv_depth(self, pixels: Tensor) -> Tensor:
         """Inverse depth ``(N)`` that is seen nearest to pixels ``(N, 2)``; 0 if all are."""
@@ -69,8 +75,9 @@ def assert_covers(
     near, far = depth_range
     share = torch.linspace(0, 1, 129, dtype=pixels.dtype)
     inv_depth = (1 / far + share * (1 / near - 1 / far)).expand(pixels.shape[0], -1)
-    places, visible = sights(views, pixels).seen(inv_depth, image_size)
-    visible &= ~on_edge(places, image_size)
+    rays = sights(views, pixels)
+    places, visible = rays.seen(inv_depth, image_size)
+    visible &= ~on_edge(places, image_size) & ~rays.on_plane(inv_depth)
     missed = visible.any(dim=-1) & ~is_good(status, VISIBLE)
     if bool(missed.any()):
         item = int(missed.nonzero()[0])
@@ -80,11 +87,10 @@ def assert_covers(
     assert_near(distance, torch.zeros_like(distance), PIXEL_TOLERANCE, "px (from the segment)")
 
 
-def on_edge(pixels: Tensor, image_size: ImageSize) -> Tensor:
+def on_edge(pixels: Tensor, image_size: ImageSize, *, within: float = PIXEL_TOLERANCE) -> Tensor:
     """Whether pixels ``(*B, 2)`` are so close to the edge that rounding decides, ``(*B)``."""
     inner, outer = (
-        in_image(pixels, image_size=image_size, border=border)
-        for border in (PIXEL_TOLERANCE, -PIXEL_TOLERANCE)
+        in_image(pixels, image_size=image_size, border=border) for border in (within, -within)
     )
     return outer & ~inner
 

@@ -104,6 +104,35 @@ def rigs(draw: st.DrawFn, num_points: int = 3) -> PosedScene:
 
 
 @st.composite
+def epipole_rigs(draw: st.DrawFn, num_points: int = 1, *, within: float = 0.0) -> PosedScene:
+    """Two views, the second on the ray of a pixel of the first: keypoints at or near the epipole.
+
+    The second view stands up to 2 m ahead or 1 m behind, 10 cm or more away, turned by up to 0.6
+    rad in each axis against the first. The points are 4 m ahead.
+
+    Args:
+        draw: given by hypothesis.
+        num_points: N.
+        within: px, how far each coordinate of the first keypoint may be from the epipole; the
+            last is up to a million times nearer.
+    """
+    K = draw(intrinsics(2))
+    pose = draw(poses(2, turn=0.3, shift=0.5))
+    epipole = draw(image_pixels(1))
+    distance = draw(st.one_of(st.floats(0.1, 2), st.floats(-1, -0.1)))  # m along z
+    center = unproject(
+        PosedViews(K[:1], pose[:1]), epipole[None], torch.full((1, 1), distance).double()
+    )
+    pose[1, :3, 3:] = -pose[1, :3, :3] @ center[0].mT
+    views = PosedViews(K, pose)
+    share = torch.logspace(0, -6, num_points, dtype=torch.float64)[:, None]
+    keypoints = epipole + share * draw(vectors(num_points, within=within, size=2))
+    depth = torch.full((1, num_points), 4.0, dtype=torch.float64)
+    scene = scene_from(views, unproject(views.select([0]), keypoints[None], depth)[0])
+    return scene._replace(pixels=torch.stack([keypoints, scene.pixels[1]]))
+
+
+@st.composite
 def depth_ranges(draw: st.DrawFn) -> DepthRange:
     """(near, far) in metres: near 0.2 to 2, far 1.5 to 20 times that, or infinite."""
     near = draw(st.floats(0.2, 2.0))

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+import deltas_geom
 from deltas_geom import ShapeError, Status, triangulate_points
 from deltas_geom.testing import DEGENERATE_SCENES, PosedScene, forward_motion, rigid
 from deltas_geom.testing.__main__ import main
@@ -250,6 +251,14 @@ def test_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(named) == 3 and {name.replace("\n", " ") for name in named} <= failed
     assert "gradients are finite differences at ties" in failed
     assert "points are exact without noise" not in failed
+
+
+def test_the_page_on_geometry_runs_and_names_what_there_is() -> None:
+    page = (DOCS.parent / "geometry.md").read_text()
+    first, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    exec(compile(first, "docs/geometry.md", "exec"), {"__name__": "page"})
+    solvers = {name for name in deltas_geom.__all__ if name.startswith("triangulate")}
+    assert set(re.findall(r"triangulate(?:_\w+)?", page)) == solvers
 
 
 def test_the_page_has_every_row() -> None:

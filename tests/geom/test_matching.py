@@ -1,5 +1,7 @@
 """Soft-argmax, and matches of both kinds."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -17,6 +19,7 @@ from deltas_geom import (
     sample_segments,
     soft_argmax,
     triangulate,
+    weights_from_covariance,
 )
 from deltas_geom.testing import PosedScene, forward_motion
 from deltas_geom.testing.scenes import IMAGE_SIZE
@@ -34,6 +37,14 @@ def test_wrong_arguments_are_named() -> None:
     samples = sample_segments(segments, 4, offsets=(0, 1))
     with pytest.raises(ValueError, match="without offsets"):
         match_per_view(torch.zeros(5, 2), samples.pixels[..., 0], samples, window=1)
+
+
+def test_wrong_covariances_and_floors_are_named() -> None:
+    with pytest.raises(ShapeError, match="covariance must have shape"):
+        weights_from_covariance(torch.zeros(4, 2))
+    for floor in (0.0, -1.0, torch.nan):
+        with pytest.raises(ValueError, match="floor must be positive"):
+            weights_from_covariance(torch.zeros(4, 2, 2), floor=floor)
 
 
 def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
@@ -165,6 +176,68 @@ def test_a_match_of_one_view_is_its_best_sample(scene: PosedScene, place: int) -
     assert (matches.weights[1:][seen] == 1).all()
     assert_close(matches.pixels[0], scene.pixels[0], rtol=0, atol=0)
     assert (matches.weights[0] == 1).all() and (matches.covariance[0] == 0).all()
+
+
+@given(spread=vectors(3, within=8.0, size=4), turn=st.floats(-3, 3), floor=st.floats(0.1, 4))
+def test_weights_do_not_know_how_the_image_is_turned(
+    spread: Tensor, turn: float, floor: float
+) -> None:
+    root = spread.reshape(3, 2, 2)
+    covariance = root @ root.mT  # px^2
+    c, s = math.cos(turn), math.sin(turn)
+    rotation = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
+    weights = weights_from_covariance(covariance, floor=floor)
+    turned = weights_from_covariance(rotation @ covariance @ rotation.mT, floor=floor)
+    assert_close(turned, weights, rtol=1e-12, atol=0)
+    variance = covariance.diagonal(dim1=-2, dim2=-1).mean(dim=-1) + floor**2
+    assert_close(weights.square().reciprocal(), variance, rtol=1e-12, atol=0)
+    assert ((weights > 0) & (weights <= 1 / floor * (1 + 1e-12))).all()
+
+
+def test_with_weights_in_1_per_px_the_covariance_of_points_is_that_of_the_noise() -> None:
+    generator = torch.Generator().manual_seed(0)
+    proj = torch.eye(3, 4, dtype=torch.float64).repeat(3, 1, 1)
+    proj[:, :2, :2] *= 500
+    proj[1:, 0, 3] = 500 * torch.tensor([-0.4, 0.4])  # m to either side
+    pixels = torch.tensor([[0.0, 0], [-100, 0], [100, 0]]).double()[:, None]  # 2 m ahead
+    deviation = torch.tensor([0.5, 0.8, 1.2]).double()  # px
+    noise = torch.randn(3, 20_000, 2, generator=generator, dtype=torch.float64)
+    seen = pixels + deviation[:, None, None] * noise
+    floor = 0.5
+    spread = (deviation**2 - floor**2)[:, None, None] * torch.eye(2, dtype=torch.float64)
+    weights = weights_from_covariance(spread, floor=floor)[:, None]
+    stated = triangulate(proj, pixels, weights, covariance=True).covariance
+    points = triangulate(proj, seen, weights.expand(3, 20_000)).points
+    assert stated is not None
+    # 20 000 draws know a standard deviation to 0.5 %; the expansion is of first order.
+    found = points.std(dim=0)
+    assert_close(found, stated[0].diagonal().sqrt(), rtol=0.02, atol=0)
+
+
+@given(covariance=extreme(4, 2, 2))
+def test_no_covariance_gives_a_weight_that_is_nan_or_inf(covariance: Tensor) -> None:
+    for dtype in (torch.float32, torch.float64):
+        spread = covariance.to(dtype).requires_grad_()
+        weights = weights_from_covariance(spread)
+        assert weights.isfinite().all() and (weights >= 0).all()
+        assert torch.autograd.grad(weights.sum(), spread)[0].isfinite().all()
+    spoilt = torch.tensor([torch.nan, torch.inf, -torch.inf, -1.0])[:, None, None].expand(4, 2, 2)
+    spoilt = spoilt.clone().requires_grad_()
+    weights = weights_from_covariance(spoilt)
+    assert (weights == 0).all()
+    assert (torch.autograd.grad(weights.sum(), spoilt)[0] == 0).all()
+
+
+def test_a_match_without_variance_weighs_one_by_the_floor(dtype: torch.dtype) -> None:
+    scene = forward_motion(dtype=dtype)
+    samples = sample_inv_depths(
+        scene.views, scene.pixels[0], INV_DEPTHS.to(dtype), image_size=IMAGE_SIZE
+    )
+    scores = torch.zeros(1, 3, 1, 31, dtype=dtype)
+    matches = match_per_view(scene.pixels[0], scores, samples)
+    weights = weights_from_covariance(matches.covariance, floor=0.25)
+    assert weights.shape == matches.weights.shape and weights.dtype == dtype
+    assert (weights[0] == 4).all() and (weights[1] < 4).all()
 
 
 def test_scores_of_views_that_see_nothing_do_not_count() -> None:

@@ -1,5 +1,7 @@
 """Gauss-Newton refinement of points, against scipy and by its invariants."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -114,6 +116,8 @@ def test_wrong_arguments_are_named() -> None:
         refine_points(proj, pixels, points, mask=torch.ones(1, 5, dtype=torch.bool))
     with pytest.raises(ValueError, match="or 'cauchy', got 'l1'"):
         refine_points(proj, pixels, points, loss="l1")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="or 'implicit', got 'none'"):
+        refine_points(proj, pixels, points, gradient="none")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="steps must not be negative, got -1"):
         refine_points(proj, pixels, points, steps=-1)
     with pytest.raises(ValueError, match="scale must be positive, got 0"):
@@ -338,6 +342,93 @@ def test_at_the_optimum_the_gradient_is_that_of_the_optimum() -> None:
         there = refine_points(scene.views.proj, moved, scene.points, steps=20).points
         measured = (there[0, coordinate] - scene.points[0, coordinate]) / step
         assert_close(gradient[1, 0, 0], measured, rtol=1e-2, atol=1e-6)
+
+
+def converged(loss: Loss) -> tuple[list[Tensor], int]:
+    """Inputs whose residuals are not small, and the steps after which their points stay."""
+    scene = scene_at(30, num_views=4, count=2)
+    weights = torch.linspace(0.5, 1.5, 8).double().reshape(4, 2)
+    start = triangulate_points(scene.views.proj, scene.pixels, weights)
+    return [scene.views.proj, scene.pixels, start, weights], 12 if loss == "squared" else 100
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_implicit_gradients_are_those_of_the_optimum(loss: Loss) -> None:
+    inputs, steps = converged(loss)
+    inputs = [value.clone().requires_grad_() for value in inputs]
+
+    def solve(*given: Tensor, gradient: Literal["unrolled", "implicit"]) -> list[Tensor]:
+        refined = refine_points(*given, steps=steps, loss=loss, scale=SCALE, gradient=gradient)
+        return [refined.points, refined.residual]
+
+    implicit = solve(*inputs, gradient="implicit")
+    unrolled = solve(*inputs, gradient="unrolled")
+    proj, pixels, start, weights = inputs
+    total = [sum(value.sin().sum() for value in found) for found in (implicit, unrolled)]
+    gradients = [torch.autograd.grad(value, inputs) for value in total]
+    assert all(map(torch.equal, implicit, unrolled))
+    for one, other in zip(*gradients, strict=True):
+        assert_close(one, other, rtol=1e-7, atol=1e-9)
+    assert (gradients[0][2] == 0).all()
+    assert torch.autograd.gradcheck(
+        lambda proj, pixels, weights: solve(
+            proj, pixels, start.detach(), weights, gradient="implicit"
+        ),
+        (proj, pixels, weights),
+        eps=1e-5,
+        atol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
+def test_transforms_derive_the_same(gradient: Literal["unrolled", "implicit"], loss: Loss) -> None:
+    inputs, _ = converged(loss)
+
+    def solve(*given: Tensor) -> Tensor:
+        return refine_points(*given, steps=4, loss=loss, scale=SCALE, gradient=gradient).points
+
+    wanted = torch.autograd.functional.jacobian(solve, tuple(inputs))
+    everything = (0, 1, 2, 3)
+    for derive in (torch.func.jacrev, torch.func.jacfwd):
+        for found, expected in zip(derive(solve, everything)(*inputs), wanted, strict=True):
+            assert_close(found, expected, rtol=1e-9, atol=1e-11)
+    one_by_one = torch.func.vmap(solve, in_dims=(None, 2, 0, 2))(
+        inputs[0], inputs[1].unsqueeze(1), inputs[2].unsqueeze(1), inputs[3].unsqueeze(1)
+    )
+    assert_close(one_by_one.squeeze(1), solve(*inputs), rtol=0, atol=1e-12)  # m
+
+
+def test_implicit_gradients_are_0_where_there_is_no_minimum() -> None:
+    scene = scene_at(30, num_views=2, count=1)
+    # Far beyond the scale a Cauchy loss bends down: from there no step is an optimum.
+    pixels = (scene.pixels + torch.tensor([[[40.0, 30]], [[-50.0, 60]]])).requires_grad_()
+    refined = refine_points(
+        scene.views.proj, pixels, scene.points, steps=0, loss="cauchy", gradient="implicit"
+    )
+    assert refined.valid.all()
+    assert (torch.autograd.grad(refined.points.sum(), pixels)[0] == 0).all()
+
+
+def test_a_compiled_step_is_the_same() -> None:
+    scene = scene_at(30, num_views=3, count=40)
+    proj, pixels = scene.views.proj, scene.pixels.clone()
+    pixels[1, 3] = torch.nan
+    torch.compiler.reset()
+    compiled = torch.compile(refine_points, fullgraph=True)(proj, pixels, scene.points)
+    eager = refine_points(proj, pixels, scene.points)
+    assert_close(compiled.points, eager.points, rtol=0, atol=1e-9)  # m
+    assert_close(compiled.residual, eager.residual, rtol=0, atol=1e-9)  # px
+    assert torch.equal(compiled.valid, eager.valid) and eager.valid.sum() == 39
+
+
+def test_half_precision_is_computed_in_double() -> None:
+    scene = forward_motion()
+    halves = [value.half() for value in (scene.views.proj, scene.pixels, scene.points + 0.02)]
+    found = refine_points(*halves, steps=3)
+    exact = refine_points(*(value.double() for value in halves), steps=3)
+    assert found.points.dtype == found.residual.dtype == torch.float16
+    assert torch.equal(found.points, exact.points.half())
 
 
 def test_what_cannot_be_refined_comes_back(dtype: torch.dtype) -> None:

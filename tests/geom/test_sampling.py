@@ -16,7 +16,8 @@ from deltas_geom import (
     sample_map,
     sample_segments,
 )
-from deltas_geom.testing import PosedScene, forward_motion
+from deltas_geom.testing import PosedScene, forward_motion, on_baseline
+from deltas_geom.testing.changes import ELSEWHERE
 from deltas_geom.testing.invariants import INVARIANTS
 from deltas_geom.testing.planar import MapScene
 from deltas_geom.testing.scenes import IMAGE_SIZE
@@ -148,6 +149,54 @@ def test_no_finite_pixel_reads_nan_or_inf(pixels: Tensor) -> None:
         assert read.isfinite().all()
         for gradient in torch.autograd.grad(read.sum(), (features, keypoints)):
             assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_a_pixel_that_is_not_finite_reads_the_border_without_gradient(
+    bad: float, dtype: torch.dtype
+) -> None:
+    # Of 3000 pixels, as the backward pass of grid_sample itself writes out of bounds at NaN.
+    ramp = torch.arange(4.0, dtype=dtype).expand(2, 4, 4).clone().requires_grad_()
+    pixels = torch.full((3000, 2), 1.5, dtype=dtype)
+    pixels[::3, 0], pixels[1::3, 1] = bad, bad
+    pixels.requires_grad_()
+    read = sample_map(ramp, pixels, image_size=(4, 4))
+    column = torch.full((3000, 2), 1.5, dtype=dtype)
+    column[::3] = 3.0 if bad == torch.inf else 0.0
+    assert_close(read, column, rtol=1e-6, atol=0)
+    of_map, of_pixels = torch.autograd.grad(read.sum(), (ramp, pixels))
+    assert_close(of_map.sum(), torch.tensor(6000.0, dtype=dtype), rtol=1e-5, atol=0)
+    assert (of_pixels[::3] == 0).all() and (of_pixels[1::3, 1] == 0).all()
+    assert_close(of_pixels[1::3, 0], torch.full((1000,), 2.0, dtype=dtype), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+def test_a_map_of_half_precision_is_read_at_exact_places(half: torch.dtype) -> None:
+    places = torch.tensor([[[13.25, 10.0], [301.5, 10.0], [633.25, 10.0]]])
+    cells = torch.arange(0.0, 80).to(half).expand(1, 4, 80).clone().requires_grad_()
+    pixels = places.clone().requires_grad_()
+    read = sample_map(cells, pixels, image_size=(32, 640))
+    assert read.dtype == torch.float32
+    wanted = (places[..., :1] + 0.5) / 8 - 0.5
+    assert_close(read, wanted, rtol=0, atol=1e-4)  # cells
+    of_map, of_pixels = torch.autograd.grad(read.sum(), (cells, pixels))
+    assert of_map.dtype == half
+    assert_close(of_pixels[..., 0], torch.full((1, 3), 1 / 8), rtol=1e-4, atol=0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert_close(sample_map(cells, places, image_size=(32, 640)), read, rtol=0, atol=0)
+    assert sample_map(cells.double(), places, image_size=(32, 640)).dtype == torch.float64
+
+
+def test_samples_at_the_sources_plane_are_masked(dtype: torch.dtype) -> None:
+    scene = on_baseline(dtype=dtype)  # the source stands 0.5 m ahead
+    inv_depths = torch.tensor([0.0, 1.0, 1.98, 2 - 4e-7, 2.0, 2 + 4e-7], dtype=dtype)
+    for views, unit in ((scene.views, 1.0), (ELSEWHERE.views(on_baseline().views), 3.0)):
+        samples = sample_inv_depths(
+            views.to(dtype), scene.pixels[0], inv_depths / unit, image_size=IMAGE_SIZE
+        )
+        assert samples.mask[0, 0, 0].tolist() == [True, True, True, False, False, False]
+        place = samples.pixels[0, 0, 0, :3]
+        assert_close(place, scene.pixels[1].expand(3, 2), rtol=1e5 * torch.finfo(dtype).eps, atol=0)
 
 
 @given(pixels=extreme(3, 2), inv_depths=extreme(4))

@@ -12,24 +12,29 @@ from deltas_geom import (
     Segments,
     ShapeError,
     Status,
+    camera_centers,
     epipolar_distance,
     epipolar_segments,
     fundamental_between,
     in_image,
+    sample_segments,
 )
 from deltas_geom.testing import (
     PosedScene,
     default_intrinsics,
     forward_motion,
+    on_baseline,
     pure_rotation,
     rigid,
     zero_baseline,
 )
+from deltas_geom.testing.changes import ELSEWHERE
 from deltas_geom.testing.invariants import INVARIANTS, World
 from deltas_geom.testing.scenes import IMAGE_SIZE
-from deltas_geom.testing.sights import sights
+from deltas_geom.testing.sights import on_edge, sights
 from deltas_geom.testing.strategies import (
     depth_ranges,
+    epipole_rigs,
     extreme,
     posed_scenes,
     rigs,
@@ -166,6 +171,86 @@ def test_float32_is_within_its_bound_of_float64(scene: PosedScene, depth_range: 
         assert ok.all()
 
 
+@given(scene=epipole_rigs(), depth_range=depth_ranges())
+@pytest.mark.parametrize("name", CLIPPED)
+def test_at_the_epipole_the_segment_is_what_is_visible(
+    name: str, scene: PosedScene, depth_range: DepthRange
+) -> None:
+    INVARIANTS[name](OURS, scene, depth_range=depth_range)
+
+
+@given(scene=epipole_rigs(), near=st.floats(0.05, 2.0))
+def test_a_keypoint_at_the_epipole_has_the_far_projection_alone(
+    scene: PosedScene, near: float
+) -> None:
+    for dtype in (torch.float32, torch.float64):
+        cast = scene._replace(views=scene.views.to(dtype), pixels=scene.pixels.to(dtype))
+        exact = cast._replace(
+            views=cast.views.to(torch.float64), pixels=cast.pixels.to(torch.float64)
+        )
+        segments = segments_of(cast, (near, 50.0))
+        far = torch.full((1, 1), 1 / 50.0, dtype=torch.float64)
+        place, seen = sights(exact.views, exact.pixels[0]).seen(far, IMAGE_SIZE)
+        if on_edge(place, IMAGE_SIZE, within=0.1).any():
+            continue
+        assert segments.status.item() == (Status.NO_PARALLAX if seen.item() else Status.EMPTY)
+        assert_close(segments.start, segments.end, rtol=0, atol=0)
+        # 32 roundings of terms up to 1000 px.
+        atol = 32 * torch.finfo(dtype).eps * 1000
+        offset = torch.where(seen, segments.start[0].double() - place[0], 0.0)
+        assert_close(offset, torch.zeros_like(offset), rtol=0, atol=atol)  # px
+
+
+@given(scene=epipole_rigs(16, within=100.0))
+def test_near_the_epipole_ends_stay_accurate(scene: PosedScene) -> None:
+    single = scene._replace(views=scene.views.to(torch.float32), pixels=scene.pixels.float())
+    segments = segments_of(single, (0.05, torch.inf))  # past the source, if that is ahead
+    exact = sights(single.views.to(torch.float64), single.pixels[0].double())
+    baseline = camera_centers(scene.views.cam_from_world).diff(dim=0).norm()
+    offset = scene.views.cam_from_world[:, :3, 3].norm(dim=-1).sum()  # from the world's origin, m
+    for end, inv_depth in (
+        (segments.start[0], segments.inv_depth_start.double()),
+        (segments.end[0], segments.inv_depth_end.double()),
+    ):
+        place, _ = exact.seen(inv_depth.mT, IMAGE_SIZE)
+        error = (place[:, 0] - end.double()).norm(dim=-1)
+        # 4 roundings of terms up to 1000 px, by the least depth of eps^1/3.
+        size = 1000 * (1 + inv_depth[0] * offset) / (1 + inv_depth[0] * baseline)
+        bound = 4 * torch.finfo(torch.float32).eps ** (2 / 3) * size
+        assert (error < bound)[segments.status[0] == Status.OK].all()  # px
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_status_at_the_epipole_does_not_know_the_worlds_frame(
+    moved: bool, dtype: torch.dtype
+) -> None:
+    scene = on_baseline()
+    views, unit = (ELSEWHERE.views(scene.views), ELSEWHERE.scale) if moved else (scene.views, 1.0)
+    # The source stands 0.5 m ahead: the range runs past its centre.
+    found = epipolar_segments(
+        views.to(dtype),
+        scene.pixels[0].to(dtype),
+        depth_range=(0.3 * unit, 50 * unit),
+        image_size=IMAGE_SIZE,
+    )
+    assert found.status.item() == Status.NO_PARALLAX
+    epipole = torch.tensor([320.0, 240.0], dtype=dtype)
+    for end in (found.start, found.end):
+        assert_close(end[0, 0], epipole, rtol=2 * torch.finfo(dtype).eps, atol=0)
+
+
+def test_a_source_that_looks_back_has_the_near_projection_at_the_epipole() -> None:
+    back = torch.diag(torch.tensor([-1.0, 1, -1, 1])).double()
+    back[2, 3] = 5.0  # m ahead, face to face
+    views = PosedViews(default_intrinsics().repeat(2, 1, 1), torch.stack([torch.eye(4), back]))
+    epipole = torch.tensor([[320.0, 240.0]]).double()
+    found = epipolar_segments(views, epipole, depth_range=(1, torch.inf), image_size=IMAGE_SIZE)
+    assert found.status.item() == Status.NO_PARALLAX
+    assert_close(found.start, found.end, rtol=0, atol=0)
+    assert_close(found.start[0], epipole, rtol=0, atol=1e-9)  # px
+    assert 0.2 < found.inv_depth_start.item() < 0.2001 and found.inv_depth_end.item() == 1
+
+
 @given(pixels=extreme(4, 2))
 def test_no_finite_keypoint_gives_nan_or_inf(pixels: Tensor) -> None:
     for dtype in (torch.float32, torch.float64):
@@ -182,6 +267,24 @@ def test_no_finite_keypoint_gives_nan_or_inf(pixels: Tensor) -> None:
         assert all(value.isfinite().all() for value in segments)
         for gradient in torch.autograd.grad(total, (keypoints, K)):
             assert gradient.isfinite().all()
+
+
+def test_segments_and_samples_export_for_any_number_of_keypoints() -> None:
+    class Sampled(torch.nn.Module):
+        def forward(self, K: Tensor, pose: Tensor, pixels: Tensor) -> tuple[Tensor, ...]:
+            found = epipolar_segments(
+                PosedViews(K, pose), pixels, depth_range=(0.3, 50.0), image_size=IMAGE_SIZE
+            )
+            return *found, *sample_segments(found, 5, offsets=(0, 1), image_size=IMAGE_SIZE)
+
+    scene = forward_motion(dtype=torch.float32)
+    keypoints = torch.export.Dim("keypoints", min=2, max=4096)
+    inputs = (scene.views.K, scene.views.cam_from_world, scene.pixels[0])
+    shapes = {"K": None, "pose": None, "pixels": {0: keypoints}}
+    exported = torch.export.export(Sampled(), inputs, dynamic_shapes=shapes)
+    more = (*inputs[:2], scene.pixels[0].repeat(5, 1) + torch.arange(15.0)[:, None])
+    for found, wanted in zip(exported.module()(*more), Sampled()(*more), strict=True):
+        assert_close(found, wanted, rtol=0, atol=0)
 
 
 def test_gradients_are_right() -> None:

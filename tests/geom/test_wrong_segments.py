@@ -187,7 +187,6 @@ BROKEN: list[tuple[Target, set[str]]] = [
         Target("too long", segments=no_farther),
         {
             "segment_ends_are_visible_depths_of_the_range",
-            "a_keypoint_at_the_epipole_stays_there",
         },
     ),
     (

@@ -132,22 +132,27 @@ def without_a_baseline_a_segment_is_a_point(
 def a_keypoint_at_the_epipole_stays_there(
     target: Target, scene: PosedScene, *, depth_range: DepthRange = RANGE
 ) -> None:
-    """Where the source moved along the keypoint's ray, all depths share the epipole."""
+    """Where the source moved along the keypoint's ray, all depths share the epipole.
+
+    The range begins before the source, or behind its centre.
+    """
     anchor = scene.views.select(0)
     height, width = IMAGE_SIZE
     corner = scene.pixels.new_tensor([width - 1, height - 1])
     pixel = scene.pixels[0, :1].clamp(min=0).minimum(corner)  # seen by both
     ray = to_homogeneous(pixel) @ torch.linalg.inv(anchor.K[0]).mT
-    ahead = anchor.cam_from_world[0].clone()
-    ahead[:3, 3] -= 0.5 * depth_range[0] * ray[0]  # not as far as the range begins
-    moved = scene.views.select([0, 0])._replace(
-        cam_from_world=torch.stack([anchor.cam_from_world[0], ahead])
-    )
-    alone = PosedScene(moved, scene.points[:1], pixel.expand(2, 1, 2))
-    start, end, status = _segments(target, alone, depth_range, IMAGE_SIZE)
-    assert_status(status, torch.tensor([Status.NO_PARALLAX]), VISIBLE)
-    for found in (start, end):
-        assert_near(found, pixel, PIXEL_TOLERANCE, "px")
+    near, far = depth_range
+    for depth in (0.5 * near, (near * min(far, 4 * near)) ** 0.5):
+        ahead = anchor.cam_from_world[0].clone()
+        ahead[:3, 3] -= depth * ray[0]
+        moved = scene.views.select([0, 0])._replace(
+            cam_from_world=torch.stack([anchor.cam_from_world[0], ahead])
+        )
+        alone = PosedScene(moved, scene.points[:1], pixel.expand(2, 1, 2))
+        start, end, status = _segments(target, alone, depth_range, IMAGE_SIZE)
+        assert_status(status, torch.tensor([Status.NO_PARALLAX]), VISIBLE)
+        for found in (start, end):
+            assert_near(found, pixel, PIXEL_TOLERANCE, "px")
 
 
 @invariant("segments", scenes="segments")
