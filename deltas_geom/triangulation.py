@@ -143,8 +143,9 @@ def triangulate(
         )
         if covariance:
             noise = unpacked3(covariance_of(observed.proj, seen, observed.weights.squared))
-            unit = observed.weights.largest.square().squeeze(-2)
-            found = (*found, noise / unit[..., None, None])
+            unit = observed.weights.largest.squeeze(-2)[..., None, None]
+            # Divided twice: the square of a small weight may be 0.
+            found = (*found, noise / unit / unit)
         outward = (tensor.to(proj.dtype).clamp(-limit, limit) for tensor in found)
         return (*outward, solved.status)
 
