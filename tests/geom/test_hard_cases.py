@@ -181,7 +181,9 @@ def test_points_are_as_exact_as_an_svd_makes_them(
     if frame == "world" and (name, views, dtype) == WORLD_LOSES:
         request.applymarker(pytest.mark.xfail(reason="a known limit: see above", strict=True))
     if (name, views, frame) == ("depth 1000 baselines", 2, "world"):
-        open_question = "beyond 3 times the SVD's error at some points: to be examined"
+        open_question = (
+            "null_vector takes the second eigenvector for simple: a wrong point is called OK"
+        )
         request.applymarker(pytest.mark.xfail(reason=open_question, strict=False))
     case = hard(name, views, dtype)
     with mpmath.workdps(DIGITS):
