@@ -151,7 +151,7 @@ class _Seen(NamedTuple):
 
 def _see(cameras: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None) -> _Seen:
     work = solver_dtype(rays)
-    pose, ray = cameras.to(work), rays.mT.to(work, memory_format=torch.contiguous_format)
+    pose, ray = cameras.to(work), rays.mT.to(work).contiguous()
     weight = ray.new_ones(()) if weights is None else weights.to(work)
     if mask is not None:
         weight = torch.where(mask, weight, 0.0)

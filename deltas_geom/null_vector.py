@@ -60,26 +60,56 @@ def null_vector(
         x = _solve_scaled(factors, x)
     x = unit(x)  # before it overflows: towards infinity each solve makes it longer
     near = _solve_scaled(factors, x)
-    quotient = _quotient(factors, near, x) - noise
-
-    factors = _factor(_shifted(matrix, quotient))
-    nearer = _solve_scaled(factors, near)
-    nearer_quotient = quotient + _quotient(factors, nearer, near)
-    # The iteration may leave for the next eigenvector, where the quotient is larger. A pivot
-    # that happens to vanish makes it NaN, which is not smaller either.
-    better = nearer_quotient <= quotient
-    x0, x1, x2, x3 = (torch.where(better, b, a) for a, b in zip(near, nearer, strict=True))
-    quotient = torch.where(better, nearer_quotient, quotient)
+    length = dot(near, near)
+    quotient = factors.d3 * dot(near, x) / length - noise
+    near, quotient = _nearer(matrix, _scaled(near, length.rsqrt()), quotient, noise)
 
     # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
     factors = _factor(_shifted(matrix, quotient + noise))
     signs = factors.i0.sign() + factors.i1.sign() + factors.i2.sign() + factors.d3.sign()
     simple = signs == 2
-    vector = _solve_scaled(factors, (x0, x1, x2, x3))
+    vector = _solve_scaled(factors, near)
     if product is not None:
         for _ in range(polish):
             vector = _polished(factors, unit(vector), product)
     return NullVector(vector, simple)
+
+
+def _nearer(
+    matrix: Symmetric4, a: Vector4, quotient: Tensor, noise: Tensor
+) -> tuple[Vector4, Tensor]:
+    """A Rayleigh quotient iteration, and the smallest of what it and its start span.
+
+    Between two close eigenvalues the iteration alone may stay where it is, or leave for the
+    larger one; in the plane of both (Rayleigh-Ritz) the smaller one is found.
+
+    Args:
+        matrix: M.
+        a: unit vector near the one looked for.
+        quotient: a^T M a.
+        noise: rounding of an eigenvalue.
+
+    Returns:
+        The vector, of any length, and its quotient.
+    """
+    # Off the quotient itself, where a pivot of a simple matrix may vanish exactly.
+    below = -0.4 * noise
+    factors = _factor(_shifted(matrix, quotient - below))
+    b = _solve_scaled(factors, a)  # K b = d3 a with K = M - shift, and a^T K a = below
+    along, length = dot(a, b), dot(b, b)
+    across = torch.addcmul(length, along, along, value=-1)
+    # K in the plane, times across: below * across, g * sqrt(across), -along * g.
+    g = _less(factors.d3, below, along)
+    half = 0.5 * torch.addcmul(below * across, along, g)
+    step = half + torch.addcmul(half * half, g * g, across).clamp(min=0).sqrt()
+    # Where both are one, or both quotients, within rounding, the iteration has converged.
+    flat = (across <= 256 * torch.finfo(length.dtype).eps * length) | (g.abs() <= noise)
+    zero, one = noise.new_zeros(()), noise.new_ones(())
+    of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
+    of_b = torch.where(flat, one, -step)
+    x0, x1, x2, x3 = (torch.addcmul(of_a * p, of_b, q) for p, q in zip(a, b, strict=True))
+    change = torch.where(flat, below - factors.d3 * along / length, step / across)
+    return (x0, x1, x2, x3), quotient - change
 
 
 def _polished(f: "_Factors", x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
@@ -137,7 +167,10 @@ def dot(a: Vector4, b: Vector4) -> Tensor:
 
 def unit(x: Vector4) -> Vector4:
     """x / |x|."""
-    scale = torch.rsqrt(dot(x, x))
+    return _scaled(x, dot(x, x).rsqrt())
+
+
+def _scaled(x: Vector4, scale: Tensor) -> Vector4:
     return x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale
 
 
@@ -222,11 +255,6 @@ def _back(f: _Factors, z0: Tensor, z1: Tensor, z2: Tensor, z3: Tensor) -> Vector
     z1 = _less(_less(z1, f.l21, z2), f.l31, z3)
     z0 = _less(_less(_less(z0, f.l10, z1), f.l20, z2), f.l30, z3)
     return z0, z1, z2, z3
-
-
-def _quotient(factors: _Factors, x: Vector4, before: Vector4) -> Tensor:
-    """x^T M x / x^T x for x = ``_solve_scaled(factors, before)``."""
-    return factors.d3 * dot(x, before) / dot(x, x)
 
 
 def _solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) -> Vector4:

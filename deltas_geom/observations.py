@@ -152,7 +152,7 @@ def observe(
     batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
     # Struct of arrays: sums over views then run over memory in order.
     work = solver_dtype(proj)
-    xy = pixels.mT.to(work, memory_format=torch.contiguous_format)
+    xy = pixels.mT.to(work).contiguous()
     x, y = xy.detach().unbind(dim=-2)
     limit = torch.finfo(work).max ** 0.25  # what is beyond overflows; NaN is not below
     sound = x * x + y * y < limit

@@ -160,7 +160,7 @@ def _pose(
     robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Tensor | None
 ) -> _Problem:
     observed = observe(proj, pixels, *weighed)
-    place = points.mT.to(observed.xy.dtype, memory_format=torch.contiguous_format)
+    place = points.mT.to(observed.xy.dtype).contiguous()
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
     start = torch.where(finite.unsqueeze(-2), place, place.new_zeros(()))
@@ -297,4 +297,4 @@ def _outward(
     # match; its gradient there is taken as 0.
     root = (torch.where(positive, error, 1.0) / total.clamp(min=1)).sqrt()
     residual = torch.where(positive, root, 0.0).clamp(max=torch.finfo(dtype).max)
-    return found.to(dtype, memory_format=torch.contiguous_format), residual.to(dtype), valid
+    return found.to(dtype).contiguous(), residual.to(dtype), valid

@@ -110,7 +110,7 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         enough = count >= 2
         posed = enough & (reach > least)
         apart = spread > 1e-3 * torch.finfo(size.dtype).eps * size
-    length = torch.where(apart, spread, 1.0).sqrt()
+    length = torch.where(apart, spread, spread.new_ones(())).sqrt()
     return RigFrame(origin, length, middle, reach, posed, enough, sick == 0)
 
 
@@ -212,9 +212,11 @@ def derivable_points(
         torch.where(valid, component.detach(), constant)
         for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
     )
-    x0, x1, x2, x3 = rayleigh_step(
-        (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), unit((x0, x1, x2, x3))
-    )
+    start = unit((x0, x1, x2, x3))
+    x0, x1, x2, x3 = rayleigh_step((m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), start)
+    # Below the step's rounding there is no derivative, and not even a sign to divide by.
+    lost = start[3].abs() <= 4 * torch.finfo(x3.dtype).eps
+    x3 = torch.where(lost, start[3], x3)
     return _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
 
 
@@ -256,5 +258,5 @@ def judge_points(
         (frame.enough, Status.TOO_FEW_VIEWS),
         (frame.finite, Status.NOT_FINITE_INPUT),
     ):
-        status = torch.where(passed, status, torch.full_like(status, reason.value))
+        status = torch.where(passed, status, status.new_full((), reason.value))
     return status

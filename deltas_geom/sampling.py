@@ -108,7 +108,7 @@ def sample_inv_depths(
     inv_depth = inv_depth.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depth.shape))
     homogeneous = rays.at(inv_depth)
     least = rays.clearance[..., None] + inv_depth.detach().abs() * rays.clearance_slope[..., None]
-    in_front = (homogeneous[..., 2] > least) & rays.finite[..., None]
+    in_front = (homogeneous[..., 2] > least) & rays.usable[..., None]
     where = safe_divide(homogeneous[..., :2], homogeneous[..., 2:], in_front[..., None])
     mask = in_front & in_image(where, image_size=image_size)
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))

@@ -31,7 +31,8 @@ class EpipolarRays(NamedTuple):
     Attributes:
         origin: ``(*B, V-1, N, 3)`` homogeneous source pixel of the point at infinity.
         slope: ``(*B, V-1, 1, 3)`` K t, the homogeneous epipole, pixels times metres.
-        finite: ``(*B, 1, N)`` bool: the keypoint is finite; if not, (0, 0) stands in for it.
+        usable: ``(*B, 1, N)`` bool: the keypoint is finite and not so far out that it overflows;
+            if not, (0, 0) stands in for it.
         clearance: ``(*B, 1, N)``, and with inverse depth it grows by ``clearance_slope``: the
             homogeneous depth from which a point counts as in front. Without gradient.
         clearance_slope: ``(*B, V-1, 1)`` metres.
@@ -42,7 +43,7 @@ class EpipolarRays(NamedTuple):
 
     origin: Tensor
     slope: Tensor
-    finite: Tensor
+    usable: Tensor
     clearance: Tensor
     clearance_slope: Tensor
     terms: Tensor
@@ -94,9 +95,10 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
         views.cam_from_world[..., 1:, :, :], views.cam_from_world[..., :1, :, :]
     )
     K_source = views.K[..., 1:, :, :]
-    finite = pixels.isfinite().all(dim=-1)
+    # NaN is not below, either.
+    usable = (pixels.detach().abs() < torch.finfo(pixels.dtype).max ** 0.75).all(dim=-1)
     # A NaN would reach the gradient of every camera through the products below.
-    known = torch.where(finite[..., None], pixels, 0.0)
+    known = torch.where(usable[..., None], pixels, 0.0)
     rays = pixel_rays(views.K[..., 0, :, :], known).unsqueeze(-3)
     translation = source_from_anchor[..., :3, 3:]
     origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
@@ -115,7 +117,7 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     return EpipolarRays(
         origin,
         slope,
-        finite.unsqueeze(-2),
+        usable.unsqueeze(-2),
         clearance,
         clearance_slope,
         terms,
@@ -186,7 +188,7 @@ def epipolar_segments(
     high = torch.where(moving & (growth < 0), crossing, infinity).amin(dim=-1)
     low, high = low.clamp(min=1 / far), high.clamp(max=1 / near)
     always_out = (~moving & (constant < 0)).any(dim=-1)
-    visible = (low <= high) & ~always_out & rays.finite
+    visible = (low <= high) & ~always_out & rays.usable
 
     low, high = torch.where(visible, low, 0.0), torch.where(visible, high, 0.0)
     ends = rays.at(torch.stack([low, high], dim=-1))
@@ -201,7 +203,8 @@ def epipolar_segments(
     a_point = still | (length <= 16 * torch.finfo(length.dtype).eps * max(height, width))
     status = torch.where(a_point, Status.NO_PARALLAX.value, Status.OK.value)
     status = torch.where(visible, status, Status.EMPTY.value)
-    status = torch.where(rays.finite, status, Status.NOT_FINITE_INPUT.value).to(torch.int8)
+    finite = pixels.isfinite().all(dim=-1).unsqueeze(-2)
+    status = torch.where(finite, status, Status.NOT_FINITE_INPUT.value).to(torch.int8)
     foreshortening = torch.where(
         visible, safe_divide(ends[..., 1, 2], ends[..., 0, 2], visible), 1.0
     )

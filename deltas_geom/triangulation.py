@@ -41,7 +41,7 @@ from deltas_geom.uncertainty import (
 )
 
 # Steps in float64. In the world's frame extreme weights leave the normal matrix few digits.
-_POLISH = {"rig": 2, "world": 12}
+_POLISH = {"rig": 2, "world": 16}
 
 
 class Triangulation(NamedTuple):

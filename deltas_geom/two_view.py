@@ -167,7 +167,7 @@ class _Seen(NamedTuple):
 
 def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
     work = solver_dtype(pixels)
-    camera, xy = proj.to(work), pixels.mT.to(work, memory_format=torch.contiguous_format)
+    camera, xy = proj.to(work), pixels.mT.to(work).contiguous()
     used = xy.new_ones((2, 1), dtype=torch.bool) if mask is None else mask
     # Products of four of what is let through can be represented. NaN is not let through.
     limit = torch.finfo(work).max ** 0.25

@@ -180,11 +180,6 @@ def test_points_are_as_exact_as_an_svd_makes_them(
         pytest.skip("two cameras that face each other see no depth")
     if frame == "world" and (name, views, dtype) == WORLD_LOSES:
         request.applymarker(pytest.mark.xfail(reason="a known limit: see above", strict=True))
-    if (name, views, frame) == ("depth 1000 baselines", 2, "world"):
-        open_question = (
-            "null_vector takes the second eigenvector for simple: a wrong point is called OK"
-        )
-        request.applymarker(pytest.mark.xfail(reason=open_question, strict=False))
     case = hard(name, views, dtype)
     with mpmath.workdps(DIGITS):
         world = exact_frames(case, "world")

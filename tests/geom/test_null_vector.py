@@ -142,3 +142,30 @@ def test_gross_outliers_leave_the_smallest_eigenvalue_found() -> None:
     smallest = torch.linalg.eigh(normal).eigenvectors[..., 0]
     wrong = (vector * smallest).sum(dim=-1).abs() < 0.999
     assert wrong.float().mean() < 0.01 and (wrong & result.simple).float().mean() < 0.005
+
+
+def test_two_close_eigenvalues_are_told_apart() -> None:
+    """A case in which the Rayleigh iteration leaves for the second eigenvector."""
+    values = [
+        719999.8266832755, 0.019752511222488778, -47535.232663905976, -190140.9957403675,
+        720000.0138667404, 41686.843648556525, 166747.38940237265,
+        5552.111347575692, 22207.7534054328, 88831.23117162606,
+    ]  # fmt: skip
+    matrix = torch.zeros(4, 4).double()
+    matrix[ROWS, COLUMNS] = matrix[COLUMNS, ROWS] = torch.tensor(values).double()
+    vector, result = found(matrix)
+    smallest = torch.linalg.eigh(matrix).eigenvectors[:, 0]
+    assert result.simple
+    assert (vector @ smallest).abs() > 1 - 1e-9
+
+
+def test_what_is_called_simple_is_the_smallest_eigenvector() -> None:
+    generator = torch.Generator().manual_seed(1)
+    basis, _ = torch.linalg.qr(torch.randn(5000, 4, 4, generator=generator, dtype=torch.float64))
+    second = 1e-6 * (1 + 10 ** (-6 * torch.rand(5000, generator=generator).double()))
+    values = torch.stack([torch.full_like(second, 1e-6), second, second * 3e5, second * 4e5], -1)
+    matrix = (basis * values.unsqueeze(-2)) @ basis.mT
+    vector, result = found(matrix / values.sum(dim=-1)[:, None, None])
+    right = (vector * basis[..., 0]).sum(dim=-1).abs() > 0.999
+    assert (result.simple & ~right).sum() == 0
+    assert (result.simple & right).float().mean() > 0.9
