@@ -205,8 +205,12 @@ def derivable_points(
     """
     # Double where: what has failed must pass no gradient and no NaN.
     easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+    trace = torch.where(valid, normal[0] + normal[4] + normal[7] + normal[9], 1.0).detach()
+    # Of trace 1, so that powers of its entries in the gradient neither overflow nor vanish.
+    share = trace.reciprocal()
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
-        torch.where(valid, entry, constant) for entry, constant in zip(normal, easy, strict=True)
+        torch.where(valid, entry, constant) * share
+        for entry, constant in zip(normal, easy, strict=True)
     )
     x0, x1, x2, x3 = (
         torch.where(valid, component.detach(), constant)
