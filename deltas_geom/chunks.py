@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_geom.recompute import recomputed
 
-_CHUNK, _SMALLEST_CHUNK = 8192, 1024  # points
+_CHUNK, _SMALLEST_CHUNK = 16384, 1024  # points
 
 Sliced = tuple[tuple[Tensor | None, int], ...]
 """Tensors and the dim along which each holds points."""

@@ -20,7 +20,7 @@ def normal_matrix(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[
         proj: ``(*B, V, 3, K)`` rows p1, p2, p3, of K = 4 (homogeneous points) or 3 entries.
         x: ``(*B, V, N)`` px.
         y: ``(*B, V, N)`` px.
-        squared: ``(*B, V, N)`` squared weights of the equations.
+        squared: ``(*B, V, N)``, or of one point for all, squared weights of the equations.
 
     Returns:
         K (K + 1) / 2 entries ``(*B, N)``.
@@ -38,7 +38,9 @@ def normal_matrix(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[
     )  # (*B, V, 4, K, K)
     upper = [squares[..., row, row:] for row in range(proj.shape[-1])]
     coefficients = torch.cat(upper, dim=-1)
-    terms = torch.stack([(x * x + y * y) * squared, x * squared, y * squared, squared], dim=-2)
+    across, down = x * squared, y * squared
+    square = torch.addcmul(x * across, y, down)
+    terms = torch.stack([square, across, down, squared.expand_as(across)], dim=-2)
     return over_views(coefficients.flatten(-3, -2).mT, terms.flatten(-3, -2))
 
 

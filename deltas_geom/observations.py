@@ -68,8 +68,11 @@ def _sum_of(row: Tensor, values: Tensor) -> Tensor:
 class Weights(NamedTuple):
     """How much each view counts for each point.
 
+    All but ``sound`` are those of one point, N = 1, where all points are alike.
+
     Attributes:
-        squared: ``(*B, V, N)`` squared weights, a point's largest 1; 0 where unused or unsound.
+        squared: ``(*B, V, N)`` squared weights, a point's largest 1; 0 where unused. 0 or
+            anything where unsound, which makes the point fail.
         largest: ``(*B, 1, N)`` a point's largest weight; 1 if that is 0.
         unused: ``(*B, V, N)`` bool.
         used: ``(*B, V, N)`` its complement as 1 and 0, to be summed.
@@ -100,7 +103,8 @@ def weigh(
     weight = like.new_ones((), dtype=work) if weights is None else weights.to(work)
     if mask is not None:
         weight = torch.where(mask, weight, 0.0)
-    weight = weight.expand(*batch, *like.shape[-3:-1])
+    alike = weights is None and mask is None
+    weight = weight.expand(*batch, like.shape[-3], 1 if alike else like.shape[-2])
     size = weight.detach().abs()
     largest = size.amax(dim=-2, keepdim=True)
     unused = size <= NEGLIGIBLE_WEIGHT * largest
@@ -109,8 +113,11 @@ def weigh(
     largest = torch.where(counted & (largest > 0), largest, one)
     # Double where: an infinite weight must not turn the gradient into NaN.
     share = torch.where(counted, weight, zero) / largest
+    # What is not sound makes its point fail, if it is used: it need not be told from point to
+    # point where all are alike.
+    counts = ~unused if alike else sound & ~unused
     return Weights(
-        squared=torch.where(sound & ~unused, share * share, zero),
+        squared=torch.where(counts, share * share, zero),
         largest=largest,
         unused=unused,
         used=(~unused).to(work),
@@ -152,10 +159,10 @@ def observe(
     batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
     # Struct of arrays: sums over views then run over memory in order.
     work = solver_dtype(proj)
-    xy = pixels.mT.to(work).contiguous()
+    xy = pixels.mT.to(work, memory_format=torch.contiguous_format).contiguous()
     x, y = xy.detach().unbind(dim=-2)
     limit = torch.finfo(work).max ** 0.25  # what is beyond overflows; NaN is not below
-    sound = x * x + y * y < limit
+    sound = torch.addcmul(x * x, y, y) < limit
     weighed = weigh(weights, mask, batch=batch, like=pixels, sound=sound)
     finite = (proj.detach().to(work).abs() < limit).all(-1).all(-1)
     # Double where throughout: what is not used must pass no gradient and no NaN.

@@ -14,7 +14,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.null_vector import Symmetric4, Vector4
+from deltas_geom.ldl import Symmetric4, Vector4
 from deltas_geom.observations import (
     Vector3,
     Weights,
@@ -139,7 +139,7 @@ def _see(
     work = solver_dtype(rays)
     batch = check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
     pose = cam_from_world.to(work)
-    ray = rays.mT.to(work).contiguous()  # (*B, V, 3, N)
+    ray = rays.mT.to(work, memory_format=torch.contiguous_format).contiguous()  # (*B, V, 3, N)
     with torch.no_grad():
         # Squares of what is let through can be represented. NaN is not let through.
         finite = (pose[..., :3, :].abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)

@@ -11,15 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.null_vector import (
-    Symmetric4,
-    Vector4,
-    null_vector,
-    rayleigh_step,
-    unit,
-)
+from deltas_geom.ldl import Symmetric4, Vector4, unit
+from deltas_geom.null_vector import null_vector, rayleigh_step
 from deltas_geom.observations import Vector3, Weights, over_views
 from deltas_geom.status import Status
+
+# Of the inputs' rounding: an error of the solver that is lost in it.
+_NEGLIGIBLE = 0.01
 
 
 class RigFrame(NamedTuple):
@@ -175,7 +173,9 @@ def find_points(
         product: see :func:`deltas_geom.null_vector.null_vector`.
         polish: see there.
     """
-    (x0, x1, x2, x3), simple = null_vector(normal, product=product, polish=polish)
+    (x0, x1, x2, x3), simple = null_vector(
+        normal, accuracy=_NEGLIGIBLE * eps, product=product, polish=polish
+    )
     points = _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
     (x, y, z), (mx, my, mz) = points, frame.middle
     distance = _squared_length((x - mx, y - my, z - mz))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deltas_geom.checks import ShapeError, check_shapes
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.null_vector import Symmetric4, Vector4
+from deltas_geom.ldl import Symmetric4, Vector4
 from deltas_geom.observations import (
     NEGLIGIBLE_WEIGHT,
     Vector3,

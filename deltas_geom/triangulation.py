@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from deltas_geom.chunks import in_chunks
+from deltas_geom.ldl import Symmetric4, Vector4
 from deltas_geom.normal_matrix import normal_matrix
-from deltas_geom.null_vector import Symmetric4, Vector4
 from deltas_geom.observations import (
     Observations,
     Vector3,
@@ -221,10 +221,25 @@ def _pose(
         ox, oy, oz = (-middle.expand_as(rig.unit) for middle in around.unbind(dim=-1))
         rig = rig._replace(origin=(ox, oy, oz), unit=torch.ones_like(rig.unit))
     x, y = observed.xy.unbind(dim=-2)
-    entries = normal_matrix(near, x, y, observed.weights.squared)
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries
-    normal = in_frame((m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), rig.origin, rig.unit)
+    squared = observed.weights.squared
+    if rig.unit.shape[-1] == 1:  # one frame for all: few cameras are moved, not every matrix
+        normal = _ten(normal_matrix(_cameras_in_frame(near, rig), x, y, squared))
+    else:
+        normal = in_frame(_ten(normal_matrix(near, x, y, squared)), rig.origin, rig.unit)
     return _Posed(observed, around, near, centers, rig, normal, proj.dtype)
+
+
+def _ten(entries: tuple[Tensor, ...]) -> Symmetric4:
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries
+    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+
+
+def _cameras_in_frame(proj: Tensor, frame: RigFrame) -> Tensor:
+    """P T of cameras ``(*B, V, 3, 4)``, where :func:`in_frame` takes M to T^T M T."""
+    rows = proj[..., :3]
+    origin = torch.stack(frame.origin, dim=-2).unsqueeze(-3)  # (*B, 1, 3, 1)
+    last = (rows @ origin + proj[..., 3:]) / frame.unit[..., None, None]
+    return torch.cat([rows.expand(*last.shape[:-1], 3), last], dim=-1)
 
 
 @torch.no_grad()

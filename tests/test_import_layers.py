@@ -25,6 +25,7 @@ ORDER = [
     "correlation",
     "matching",
     "chunks",
+    "ldl",
     "null_vector",
     "observations",
     "normal_matrix",

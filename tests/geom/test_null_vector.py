@@ -1,22 +1,15 @@
 """The null vector of symmetric 4x4 matrices."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.null_vector import (
-    NullVector,
-    Symmetric4,
-    Vector4,
-    dot,
-    multiply,
-    null_vector,
-    rayleigh_step,
-    unit,
-)
+from deltas_geom.ldl import Symmetric4, Vector4, dot, multiply, unit
+from deltas_geom.null_vector import NullVector, _proved, null_vector, rayleigh_step
 from deltas_geom.testing.strategies import vectors
 
 ROWS, COLUMNS = torch.triu_indices(4, 4)
@@ -169,3 +162,43 @@ def test_what_is_called_simple_is_the_smallest_eigenvector() -> None:
     right = (vector * basis[..., 0]).sum(dim=-1).abs() > 0.999
     assert (result.simple & ~right).sum() == 0
     assert (result.simple & right).float().mean() > 0.9
+
+
+def spread_eigenvalues(count: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """Matrices from easy to hopeless, and their smallest eigenvectors."""
+    random = torch.Generator().manual_seed(2)
+    basis, _ = torch.linalg.qr(torch.randn(count, 4, 4, generator=random, dtype=torch.float64))
+    second = 10 ** (-8 * torch.rand(count, generator=random, dtype=torch.float64))
+    smallest = second * 10 ** (-0.5 - 11 * torch.rand(count, generator=random, dtype=torch.float64))
+    values = torch.stack([smallest, second, 0 * second + 1, 0 * second + 2], dim=-1)
+    matrix = (basis * values.unsqueeze(-2)) @ basis.mT
+    return (matrix / values.sum(dim=-1)[:, None, None]).to(dtype), basis[..., 0]
+
+
+@pytest.mark.parametrize("accuracy", [1e-9, 1e-5])
+def test_what_is_proved_is_as_accurate_as_said(accuracy: float) -> None:
+    matrix, _ = spread_eigenvalues(20_000)
+    vector, proved = _proved(packed(matrix), accuracy)
+    exact, _ = null_vector(packed(matrix))
+    found, wanted = torch.stack(unit(vector), dim=-1), torch.stack(unit(exact), dim=-1)
+    error = (found - wanted * (found * wanted).sum(-1, keepdim=True).sign()).norm(dim=-1)
+    assert 0.1 < proved.float().mean() < 0.9  # some are hard, or nothing is tested
+    rounding = 64 * torch.finfo(matrix.dtype).eps / torch.linalg.eigvalsh(matrix)[:, 1]
+    assert (error <= accuracy + rounding)[proved].all()
+
+
+def test_easy_and_hard_ones_together_are_as_each_alone() -> None:
+    matrix, smallest = spread_eigenvalues(500)
+    matrix[7], matrix[11] = torch.nan, 0.0
+    together = null_vector(packed(matrix.reshape(5, 100, 4, 4)), accuracy=1e-9)
+    found = torch.stack(unit(together.vector), dim=-1)
+    assert found.shape == (5, 100, 4) and together.simple.shape == (5, 100)
+    assert not together.simple[0, [7, 11]].any() and together.simple.float().mean() > 0.9
+    cosine = (found.reshape(500, 4) * smallest).sum(dim=-1).abs()
+    assert cosine[together.simple.flatten()].min() > 1 - 1e-9
+    for number in range(40):
+        alone = null_vector(packed(matrix[number]), accuracy=1e-9)
+        assert alone.simple == together.simple.flatten()[number]
+        if alone.simple:
+            wanted = torch.stack(unit(alone.vector), dim=-1)
+            assert_close(found.reshape(500, 4)[number], wanted, rtol=0, atol=1e-15)

@@ -183,8 +183,9 @@ def test_vmap_is_a_batch_dim(name: str) -> None:
             assert_close(found, one, rtol=1e-9, atol=1e-12)
 
 
-def test_vmap_keeps_status_and_masks() -> None:
-    proj, pixels, weights = many(3)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_vmap_keeps_status_and_masks(dtype: torch.dtype) -> None:
+    proj, pixels, weights = many(3, dtype)
     mask = torch.ones(4, 3, 3, dtype=torch.bool)
     mask[1, :, 0], mask[2, 0] = False, False
 
