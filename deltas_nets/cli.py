@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.config import TrainConfig, to_dict
+from deltas_nets.cli_training import Cost, Flag, Train, preset_of
+from deltas_nets.config import TRAIN_CONFIGS, to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.network.deltas import Deltas
     from deltas_nets.predict import PredictConfig
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 
 @dataclass(frozen=True)
@@ -211,69 +210,6 @@ class Evaluate(_Prediction):
             write_json(self.json, scores_as_json(scores))
 
 
-@dataclass(frozen=True)
-class Train:
-    """Train a network on procedural rooms.
-
-    Writes config.json, checkpoint.pt, weights.safetensors and log.jsonl into --out; a run that
-    was stopped goes on with --resume, or from weights alone with --init and --start-step.
-
-    Example: deltas train --out runs/first --steps 2000
-    """
-
-    out: Path
-    """Folder of the run."""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
-    resume: Flag = False
-    """Go on from the checkpoint in --out, with the config recorded there."""
-    init: Path | None = None
-    """Start from these weights."""
-    start_step: int = 0
-    """Go on in the schedule at this step (with --init)."""
-    checkpoint_every: int = 200
-    """Steps between checkpoints; Ctrl-C writes one too."""
-    validate_every: int = 500
-    """Steps between evaluations on rooms that no training sees."""
-    encoder: str = "pretrained"
-    """EfficientNet-Lite0 weights for the encoder: "pretrained" is the package of the train
-    extra, "none" starts from random weights, otherwise a file."""
-    debug: Flag = False
-    """Show the traceback of an error."""
-
-    def run(self) -> None:
-        """Do it."""
-        from deltas_nets.checked_inputs import encoder_file
-        from deltas_nets.train.checkpoint import load_config
-        from deltas_nets.train.fit import Start, fit
-
-        if self.resume and self.config != TrainConfig():
-            raise UserError(
-                "a resumed run keeps its config", "--resume", "leave out the options that change it"
-            )
-        if self.start_step and self.init is None:
-            raise UserError("start from what?", "--start-step", "add --init FILE")
-        config = load_config(self.out) if self.resume else self.config
-        if self.start_step >= config.steps:
-            raise UserError(
-                f"the schedule ends at {config.steps}", "--start-step", "start before that"
-            )
-        if not self.resume and (self.out / "checkpoint.pt").exists():
-            raise UserError(
-                "the folder holds another run", self.out, "add --resume or name a new folder"
-            )
-        fresh = not self.resume and self.init is None
-        encoder = encoder_file(self.encoder) if fresh else None
-        start = Start(encoder, self.init, self.start_step, self.resume)
-        weights = fit(
-            config,
-            self.out,
-            start,
-            checkpoint_every=self.checkpoint_every,
-            validate_every=self.validate_every,
-        )
-        print(f"weights in {weights}")
-
-
 def main() -> None:
     """Entry point of the `deltas` command."""
     if sys.argv[1:] == ["--version"]:
@@ -291,13 +227,19 @@ def main() -> None:
         sys.exit(130)
 
 
-def _parse(arguments: list[str]) -> Demo | Depth | Evaluate | Train:
+Command = Demo | Depth | Evaluate | Train | Cost
+
+
+def _parse(arguments: list[str]) -> Command:
     """The command that the arguments name; one line of error where they make no sense."""
     said = io.StringIO()
+    preset = preset_of(arguments)
+    default = Train(out=tyro.MISSING, preset=preset, config=TRAIN_CONFIGS[preset])
+    train = Annotated[Train, tyro.conf.subcommand(name="train", default=default)]
     try:
         with contextlib.redirect_stderr(said):
-            command: Demo | Depth | Evaluate | Train = tyro.cli(
-                Demo | Depth | Evaluate | Train,
+            command: Command = tyro.cli(
+                Demo | Depth | Evaluate | train | Cost,
                 prog="deltas",
                 description="Metric depth from posed images.",
                 args=arguments,
@@ -314,7 +256,8 @@ def _parse(arguments: list[str]) -> Demo | Depth | Evaluate | Train:
 
 
 def _help_of(arguments: list[str]) -> str:
-    known = [word for word in arguments[:1] if word in ("demo", "depth", "evaluate", "train")]
+    commands = ("demo", "depth", "evaluate", "train", "cost")
+    known = [word for word in arguments[:1] if word in commands]
     return " ".join(["see deltas", *known, "--help"])
 
 

@@ -64,10 +64,27 @@ class NetworkConfig:
     name: str = "deltas-small"
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    backbone: Literal["lite", "resnet50", "vgg9"] = "lite"
+    """Image encoder: lite is EfficientNet-Lite0; the others are the paper's and bring its heads and
+    densifier."""
     descriptor_dim: int = 48
-    """Channels of the descriptors, which are at half the image's resolution."""
-    densifier_widths: tuple[int, int, int, int] = (32, 48, 64, 96)
-    """Channels of the densifier at 1/2, 1/4, 1/8, 1/16."""
+    """Channels of the descriptors, which are at 1/2 of the image's resolution (the paper: 128 at
+    1/8)."""
+    head_width: int = 256
+    """Channels inside the paper's detector and descriptor heads; lite has its own."""
+    densifier_widths: tuple[int, ...] = (32, 48, 64, 96)
+    """Channels of the densifier: lite at 1/2, 1/4, 1/8, 1/16; else of the five blocks of the
+    decoder, coarse to fine."""
+
+    def __post_init__(self) -> None:
+        wanted = 4 if self.backbone == "lite" else 5
+        if len(self.densifier_widths) != wanted:
+            raise ValueError(
+                f"densifier_widths must be {wanted} numbers for {self.backbone}, got "
+                f"{self.densifier_widths}"
+            )
+        if self.backbone != "lite" and self.matcher.kind == "joint":
+            raise ValueError(f"the joint matcher needs the lite backbone, got {self.backbone}")
 
 
 @dataclass(frozen=True)
@@ -128,9 +145,25 @@ class TrainConfig:
     sizes: tuple[tuple[int, int], ...] = ((144, 192), (144, 192), (192, 256))
     """(height, width) of the images of a step, drawn at random."""
     batch_size: int = 6
-    """Rooms per step."""
+    """Rooms per step, of all processes together: their number changes no result."""
+    accumulate: int = 1
+    """Passes that a process takes over its part of a step, to need less memory; the result is
+    that of one pass, for four tenths more time (batch norm sees the rooms of one pass)."""
+    devices: int = 1
+    """Processes on each machine, one a GPU; torchrun and fabric run decide it themselves."""
+    num_nodes: int = 1
+    """Machines; torchrun and fabric run decide it themselves."""
+    sync_batchnorm: bool = True
+    """Batch norm sees the rooms of all GPUs; with one, or on CPUs, nothing changes."""
+    freeze_batch_norm: bool = False
+    """Batch norm keeps its mean and variance, as for fine-tuning with few rooms per step; its
+    scale and shift still learn."""
     learning_rate: float = 2e-3
-    """Peak of the one-cycle schedule; the pretrained encoder gets a fifth of it."""
+    """Peak of the schedule."""
+    encoder_rate: float = 0.2
+    """The encoder, which is pretrained, learns at this share of it."""
+    schedule: Literal["cosine", "constant"] = "cosine"
+    """After the warm-up: half a cosine down to a hundredth, or the peak to the end."""
     weight_decay: float = 1e-4
     """Of AdamW."""
     warmup: int = 100
@@ -158,8 +191,14 @@ class TrainConfig:
                 f"views must satisfy 2 <= min_views <= max_views <= data.num_views, got "
                 f"{self.min_views}, {self.max_views}, {self.data.num_views}"
             )
-        if self.steps < 1 or self.batch_size < 1:
-            raise ValueError("steps and batch_size must be at least 1")
+        for name in ("steps", "batch_size", "accumulate", "devices", "num_nodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.batch_size % self.accumulate:
+            raise ValueError(
+                f"batch_size must be a multiple of accumulate, got {self.batch_size} and "
+                f"{self.accumulate}"
+            )
         if not self.sizes or min(map(min, self.sizes)) < 32:
             raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {self.sizes}")
 
@@ -199,5 +238,61 @@ def _as_tuples(value: Any) -> Any:
     return tuple(_as_tuples(item) for item in value) if isinstance(value, list) else value
 
 
-CONFIGS: dict[str, NetworkConfig] = {"deltas-small": NetworkConfig()}
-"""Networks by name."""
+_PAPER_DETECTOR = DetectorConfig(num_keypoints=512, nms_radius=9, border=4)
+_PAPER_MATCHER = MatcherConfig(kind="per_view", num_samples=100)
+
+CONFIGS: dict[str, NetworkConfig] = {
+    "deltas-small": NetworkConfig(),
+    "deltas-resnet50": NetworkConfig(
+        name="deltas-resnet50",
+        detector=_PAPER_DETECTOR,
+        matcher=_PAPER_MATCHER,
+        backbone="resnet50",
+        descriptor_dim=128,
+        densifier_widths=(512, 256, 128, 64, 32),
+    ),
+    "deltas-vgg9": NetworkConfig(
+        name="deltas-vgg9",
+        detector=_PAPER_DETECTOR,
+        matcher=_PAPER_MATCHER,
+        backbone="vgg9",
+        descriptor_dim=128,
+        head_width=128,
+        densifier_widths=(96, 64, 32, 16, 8),
+    ),
+}
+"""Networks by name; the second is the paper's, the third the light one of its supplement."""
+
+PAPER_LOSS = LossConfig(
+    match=1.0, smoothness=1.0, gradient=0.0, posterior=0.0, confidence=0.0, spread=0.0
+)
+"""The five terms with the paper's weights, and no other."""
+
+
+def _as_in_the_paper(name: str) -> TrainConfig:
+    """Section 4.1: 100 000 steps of 24 triplets at 240 x 320, Adam at 1e-4 throughout."""
+    return TrainConfig(
+        network=CONFIGS[name],
+        loss=dataclasses.replace(PAPER_LOSS, spread=0.1),
+        data=DataConfig(height=240, width=320),
+        steps=100_000,
+        sizes=((240, 320),),
+        batch_size=24,
+        learning_rate=1e-4,
+        encoder_rate=1.0,
+        schedule="constant",
+        weight_decay=0.0,
+        min_views=3,
+        max_views=3,
+        num_keypoints=512,
+        pose_noise=(0.0, 0.0),
+    )
+
+
+TRAIN_CONFIGS: dict[str, TrainConfig] = {
+    "deltas-small": TrainConfig(),
+    "deltas-resnet50": _as_in_the_paper("deltas-resnet50"),
+    "deltas-vgg9": _as_in_the_paper("deltas-vgg9"),
+}
+"""Training by network. The paper's have its five losses, and a little of the likelihood that
+teaches the dense map's spread."""

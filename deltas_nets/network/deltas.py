@@ -15,12 +15,11 @@ from deltas_geom import (
 )
 from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
 from deltas_nets.config import NetworkConfig
-from deltas_nets.network.densifier import DenseDepth, Densifier
-from deltas_nets.network.descriptor import Descriptor
-from deltas_nets.network.detector import Detector, Keypoints
-from deltas_nets.network.encoder import Encoder
+from deltas_nets.network.build import build_stages
+from deltas_nets.network.densifier import DenseDepth
+from deltas_nets.network.detector import Keypoints
 from deltas_nets.network.layers import upsample_like
-from deltas_nets.network.matcher import Posterior, build_matcher
+from deltas_nets.network.matcher import Posterior
 
 
 class Evidence(NamedTuple):
@@ -84,11 +83,12 @@ class Deltas(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = Encoder()
-        self.detector = Detector(config.detector)
-        self.descriptor = Descriptor(config.descriptor_dim)
-        self.matcher = build_matcher(config.matcher, config.descriptor_dim)
-        self.densifier = Densifier(config.densifier_widths)
+        stages = build_stages(config)
+        self.encoder = stages.encoder
+        self.detector = stages.detector
+        self.descriptor = stages.descriptor
+        self.matcher = stages.matcher
+        self.densifier = stages.densifier
 
     def forward(
         self,

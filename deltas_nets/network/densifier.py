@@ -23,7 +23,8 @@ class DenseDepth(NamedTuple):
     """Dense depth of the anchor.
 
     Attributes:
-        log_depth: four ``(B, 1, h, w)`` at 1/2, 1/4, 1/8, 1/16; log metres.
+        log_depth: four ``(B, 1, h, w)``, each half as large as the one before, the finest at the
+            image's or half its resolution; log metres.
         log_spread: ``(B, 1, H/2, W/2)`` log of the Laplace scale of the error of log depth.
     """
 

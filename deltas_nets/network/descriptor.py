@@ -17,8 +17,9 @@ class Descriptors(NamedTuple):
     """What points are recognised by.
 
     Attributes:
-        maps: ``(B, V, D, H/2, W/2)`` of unit length along D.
-        context: ``(B, V, 48, H/8, W/8)`` what kind of surface this is, in a wider surrounding.
+        maps: ``(B, V, D, h, w)`` of unit length along D, at 1/2 (the paper: 1/8).
+        context: ``(B, V, C, H/8, W/8)``, C = 48 (the paper: 0), what kind of surface this is, in
+            a wider surrounding.
     """
 
     maps: Tensor

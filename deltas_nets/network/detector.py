@@ -63,31 +63,52 @@ class Detector(nn.Module):
         anchor = features.of_anchor()
         coarse = upsample_like(self.coarse(anchor.sixteenth), anchor.eighth)
         logits = self.head(torch.cat([coarse, anchor.eighth], dim=1)).float()
-        count = num_keypoints or self.config.num_keypoints
-        spread = spread_points(count, image_size=image_size).to(logits.device)
-        if shift is None:
-            shift = torch.zeros(len(logits), 2, device=logits.device)
-        size = torch.tensor(image_size[::-1], device=logits.device)
-        pixels = (spread + (shift[:, None] * size).floor()).remainder(size)
-        best, scores = self._best(detector_heatmap(logits.detach(), image_size=image_size), count)
-        detected = scores > self.config.threshold
-        pixels[:, : best.shape[1]] = torch.where(
-            detected[..., None], best, pixels[:, : best.shape[1]]
+        return choose_keypoints(
+            logits, self.config, image_size=image_size, num_keypoints=num_keypoints, shift=shift
         )
-        padded = F.pad(torch.where(detected, scores, 0.0), (0, count - scores.shape[1]))
-        return Keypoints(pixels, padded, logits)
 
-    def _best(self, heatmap: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """The strongest local maxima ``(B, n, 2)`` and their probabilities ``(B, n)``."""
-        border, window = self.config.border, 2 * self.config.nms_radius + 1
-        peaks = nms2d(heatmap, (window, window))[:, 0]
-        inner = torch.zeros_like(peaks)
-        inner[:, border:-border, border:-border] = peaks[:, border:-border, border:-border]
-        width = heatmap.shape[-1]
-        wanted = min(int(count * self.config.detected_share), inner[0].numel())
-        scores, index = inner.flatten(1).topk(wanted, dim=1)
-        columns, rows = index % width, index.div(width, rounding_mode="floor")
-        return torch.stack([columns, rows], dim=-1).to(heatmap.dtype), scores
+
+def choose_keypoints(
+    logits: Tensor,
+    config: DetectorConfig,
+    *,
+    image_size: tuple[int, int],
+    num_keypoints: int | None = None,
+    shift: Tensor | None = None,
+) -> Keypoints:
+    """The best detections, and evenly spread points for the rest.
+
+    Args:
+        logits: ``(B, 65, h, w)`` of the 8 x 8 cells.
+        config: how many, how strong and how far apart.
+        image_size: (height, width).
+        num_keypoints: instead of the config's.
+        shift: ``(B, 2)`` in [0, 1): moves the spread points.
+    """
+    count = num_keypoints or config.num_keypoints
+    spread = spread_points(count, image_size=image_size).to(logits.device)
+    if shift is None:
+        shift = torch.zeros(len(logits), 2, device=logits.device)
+    size = torch.tensor(image_size[::-1], device=logits.device)
+    pixels = (spread + (shift[:, None] * size).floor()).remainder(size)
+    best, scores = _best(detector_heatmap(logits.detach(), image_size=image_size), config, count)
+    detected = scores > config.threshold
+    pixels[:, : best.shape[1]] = torch.where(detected[..., None], best, pixels[:, : best.shape[1]])
+    padded = F.pad(torch.where(detected, scores, 0.0), (0, count - scores.shape[1]))
+    return Keypoints(pixels, padded, logits)
+
+
+def _best(heatmap: Tensor, config: DetectorConfig, count: int) -> tuple[Tensor, Tensor]:
+    """The strongest local maxima ``(B, n, 2)`` and their probabilities ``(B, n)``."""
+    border, window = config.border, 2 * config.nms_radius + 1
+    peaks = nms2d(heatmap, (window, window))[:, 0]
+    inner = torch.zeros_like(peaks)
+    inner[:, border:-border, border:-border] = peaks[:, border:-border, border:-border]
+    width = heatmap.shape[-1]
+    wanted = min(int(count * config.detected_share), inner[0].numel())
+    scores, index = inner.flatten(1).topk(wanted, dim=1)
+    columns, rows = index % width, index.div(width, rounding_mode="floor")
+    return torch.stack([columns, rows], dim=-1).to(heatmap.dtype), scores
 
 
 def detector_heatmap(logits: Tensor, *, image_size: tuple[int, int]) -> Tensor:

@@ -1,5 +1,6 @@
 """The command: what it writes, what it says, and one line for everything that is wrong."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import pytest
 from PIL import Image
 
 from deltas_nets import cli
-from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
+from deltas_nets.cli_training import Train
+from deltas_nets.config import TRAIN_CONFIGS, DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs import read_depth_png, read_points_ply
 from deltas_nets.pretrained import save_weights
@@ -387,3 +389,22 @@ def test_the_version_is_told(run: Run) -> None:
 def test_help_does_not_wait_for_torch() -> None:
     code = "import sys, deltas_nets.cli; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_cost_prints_every_stage_and_writes_json(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "cost.json"
+    said = run("cost", "deltas-small", "--size", 48, 64, "--repeats", 1, "--json", file)
+    assert said.code == 0, said.err
+    for stage in ("encoder", "detector", "descriptor", "matcher", "densifier", "geometry"):
+        assert stage in said.out
+    assert "deltas-small" in json.loads(file.read_text())["networks"]
+
+
+def test_a_config_sets_the_defaults_and_flags_change_them() -> None:
+    arguments = ["train", "--out", "x", "--config", "deltas-vgg9", "--steps", "5000"]
+    command = cli._parse(arguments)
+    assert isinstance(command, Train)
+    wanted = dataclasses.replace(TRAIN_CONFIGS["deltas-vgg9"], steps=5000)
+    assert command.config == wanted and command.config.batch_size == 24
+    small = cli._parse(["train", "--out", "x"])
+    assert isinstance(small, Train) and small.config == TRAIN_CONFIGS["deltas-small"]

@@ -1,0 +1,138 @@
+"""The commands for those who build networks: `deltas train` and `deltas cost`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from deltas_nets.config import CONFIGS, TRAIN_CONFIGS, TrainConfig
+from deltas_nets.errors import UserError
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+Network = Literal["deltas-small", "deltas-resnet50", "deltas-vgg9"]
+NETWORKS: tuple[Network, ...] = ("deltas-small", "deltas-resnet50", "deltas-vgg9")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network on procedural rooms.
+
+    Writes config.json, checkpoint.pt, weights.safetensors and log.jsonl into --out; a run that
+    was stopped goes on with --resume, or from weights alone with --init and --start-step.
+
+    Example: deltas train --out runs/first --steps 2000
+
+    On several GPUs: torchrun --nproc-per-node 4 -m deltas_nets.cli train --out runs/first
+    """
+
+    out: Path
+    """Folder of the run."""
+    preset: Annotated[Network, tyro.conf.arg(name="config")] = "deltas-small"
+    """Network and training to start from; the other flags change it. deltas-resnet50 and
+    deltas-vgg9 are the paper's, with its losses and schedule."""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    resume: Flag = False
+    """Go on from the checkpoint in --out, with the config recorded there."""
+    init: Path | None = None
+    """Start from these weights."""
+    start_step: int = 0
+    """Go on in the schedule at this step (with --init)."""
+    checkpoint_every: int = 200
+    """Steps between checkpoints; Ctrl-C writes one too."""
+    validate_every: int = 500
+    """Steps between evaluations on rooms that no training sees."""
+    encoder: str = "pretrained"
+    """Weights for the encoder: "pretrained" is EfficientNet-Lite0 from the package of the train
+    extra (the paper's backbones start from random weights), "none" starts from random weights,
+    otherwise a file: EfficientNet-Lite0's, or ResNet-50's with the common key names."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Do it."""
+        from deltas_nets.checked_inputs import encoder_file
+        from deltas_nets.train.checkpoint import load_config
+        from deltas_nets.train.fit import Start, fit
+
+        if self.resume and self.config != TRAIN_CONFIGS[self.preset]:
+            raise UserError(
+                "a resumed run keeps its config", "--resume", "leave out the options that change it"
+            )
+        if self.start_step and self.init is None:
+            raise UserError("start from what?", "--start-step", "add --init FILE")
+        config = load_config(self.out) if self.resume else self.config
+        if self.start_step >= config.steps:
+            raise UserError(
+                f"the schedule ends at {config.steps}", "--start-step", "start before that"
+            )
+        if not self.resume and (self.out / "checkpoint.pt").exists():
+            raise UserError(
+                "the folder holds another run", self.out, "add --resume or name a new folder"
+            )
+        fresh = not self.resume and self.init is None
+        wanted = fresh and (config.network.backbone == "lite" or self.encoder != "pretrained")
+        encoder = encoder_file(self.encoder) if wanted else None
+        start = Start(encoder, self.init, self.start_step, self.resume)
+        weights = fit(
+            config,
+            self.out,
+            start,
+            checkpoint_every=self.checkpoint_every,
+            validate_every=self.validate_every,
+        )
+        print(f"weights in {weights}")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Parameters, multiply-accumulates and time of a network by stage, beside the paper's.
+
+    Example: deltas cost deltas-small --views 3
+    """
+
+    networks: tyro.conf.Positional[tuple[Network, ...]] = NETWORKS
+    """Which ones."""
+    views: int = 2
+    """Views, the anchor included."""
+    size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (240, 320)
+    """Of the images."""
+    num_keypoints: int = 512
+    """Points to triangulate."""
+    repeats: int = 5
+    """Runs that are timed."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, mps."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write everything to this file."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Do it."""
+        from deltas_nets.checked_inputs import usable_device
+        from deltas_nets.cost.command import run_cost
+        from deltas_nets.network.deltas import Deltas
+        from deltas_nets.outputs import check_writable
+
+        if self.json is not None:
+            check_writable(self.json.parent)
+        device = usable_device(self.device)
+        run_cost(
+            {name: Deltas(CONFIGS[name]).to(device).eval() for name in self.networks},
+            num_views=self.views,
+            image_size=self.size,
+            num_keypoints=self.num_keypoints,
+            repeats=self.repeats,
+            json=self.json,
+        )
+
+
+def preset_of(arguments: list[str]) -> Network:
+    """What --config names: the defaults of the other flags depend on it."""
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        name = word.partition("=")[2] if word.startswith("--config=") else following
+        for network in NETWORKS:
+            if word.partition("=")[0] == "--config" and name == network:
+                return network
+    return "deltas-small"

@@ -1,0 +1,91 @@
+"""What `deltas cost` does: measure, print, write."""
+
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from torch import nn
+
+from deltas_nets.atomic_files import write_json
+from deltas_nets.cost.literature import PAPER_SETTING
+from deltas_nets.cost.measure import cost_of
+from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
+from deltas_nets.errors import UserError
+from deltas_nets.terminal import warn
+
+MIN_SIDE = 32
+"""Images may not be lower or narrower: nothing would be left at the coarsest scale, pixels."""
+
+
+def run_cost(
+    models: Mapping[str, nn.Module],
+    *,
+    num_views: int = 2,
+    image_size: tuple[int, int] = (240, 320),
+    num_keypoints: int = 512,
+    repeats: int = 5,
+    json: Path | None = None,
+) -> None:
+    """Print what each network costs, and beside the paper's figures if the setting is the paper's.
+
+    Args:
+        models: by name, called as `Deltas` is.
+        num_views: the anchor and its sources.
+        image_size: (height, width).
+        num_keypoints: points to triangulate.
+        repeats: runs that are timed.
+        json: also write everything here.
+
+    Raises:
+        UserError: the setting makes no sense, or the file cannot be written.
+    """
+    if num_views < 2 or repeats < 1 or num_keypoints < 1 or min(image_size) < MIN_SIDE:
+        raise UserError(
+            f"cannot measure {num_views} views of {image_size[0]} x {image_size[1]}, "
+            f"{num_keypoints} keypoints, {repeats} times",
+            "command line",
+            f"ask for 2 views, {MIN_SIDE} pixels, 1 keypoint and 1 run or more",
+        )
+    console = Console()
+    height, width = image_size
+    setting = f"{num_views} views, {height} x {width}, {num_keypoints} keypoints"
+    costs = {}
+    for name, model in models.items():
+        cost = costs[name] = cost_of(model, num_views, image_size, num_keypoints, repeats=repeats)
+        console.print(cost_table(cost, title=f"{name}: {setting}"))
+        console.print(
+            f"Intermediate tensors hold {cost.peak_bytes / 1e6:.1f} MB at once. Products are "
+            "convolutions and matrix products; a multiply-accumulate is two operations. Times "
+            f"are the median of {repeats}, on {device_name(model)}.\n"
+        )
+        if cost.unknown:
+            warn(f"{name}: not counted for want of a formula: {', '.join(sorted(cost.unknown))}")
+    if (num_views, image_size, num_keypoints) == PAPER_SETTING:
+        console.print(comparison_table(costs))
+    if json is not None:
+        devices = {name: device_name(model) for name, model in models.items()}
+        write_json(
+            json,
+            {
+                "num_views": num_views,
+                "image_size": image_size,
+                "num_keypoints": num_keypoints,
+                "repeats": repeats,
+                "devices": devices,
+                "torch": torch.__version__,
+                **costs_as_json(costs),
+            },
+        )
+
+
+def device_name(model: nn.Module) -> str:
+    """Where the model is, in words that say what its times are worth."""
+    device = next(model.parameters()).device
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "cpu":
+        threads = torch.get_num_threads()
+        return f"{platform.machine()} CPU, {threads} thread{'s' if threads > 1 else ''}"
+    return str(device)

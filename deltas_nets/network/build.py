@@ -1,0 +1,62 @@
+"""From a config to the five stages of a network."""
+
+from typing import NamedTuple
+
+from deltas_nets.config import NetworkConfig
+from deltas_nets.network.densifier import Densifier
+from deltas_nets.network.descriptor import Descriptor
+from deltas_nets.network.detector import Detector
+from deltas_nets.network.encoder import Encoder
+from deltas_nets.network.matcher import Matcher, build_matcher
+from deltas_nets.network.paper import (
+    PaperDensifier,
+    PaperDescriptor,
+    PaperDetector,
+    PaperEncoder,
+)
+from deltas_nets.network.resnet import ResNet50
+from deltas_nets.network.taps import Backbone
+from deltas_nets.network.vgg import VGG9
+
+
+class Stages(NamedTuple):
+    """What :class:`deltas_nets.network.deltas.Deltas` composes, in order."""
+
+    encoder: Encoder | PaperEncoder
+    detector: Detector | PaperDetector
+    descriptor: Descriptor | PaperDescriptor
+    matcher: Matcher
+    densifier: Densifier | PaperDensifier
+
+
+def build_stages(config: NetworkConfig) -> Stages:
+    """The stages that a config names."""
+    matcher = build_matcher(config.matcher, config.descriptor_dim)
+    if config.backbone == "lite":
+        return Stages(
+            Encoder(),
+            Detector(config.detector),
+            Descriptor(config.descriptor_dim),
+            matcher,
+            Densifier(_four(config.densifier_widths)),
+        )
+    backbones: dict[str, type[Backbone]] = {"resnet50": ResNet50, "vgg9": VGG9}
+    backbone = backbones[config.backbone]
+    image, sparse = backbone(3, 64), backbone(1, 16)
+    return Stages(
+        PaperEncoder(image),
+        PaperDetector(config.detector, image.channels, config.head_width),
+        PaperDescriptor(image.channels, config.descriptor_dim, config.head_width),
+        matcher,
+        PaperDensifier(sparse, image.channels, _five(config.densifier_widths)),
+    )
+
+
+def _four(widths: tuple[int, ...]) -> tuple[int, int, int, int]:
+    half, quarter, eighth, sixteenth = widths
+    return half, quarter, eighth, sixteenth
+
+
+def _five(widths: tuple[int, ...]) -> tuple[int, int, int, int, int]:
+    sixteenth, eighth, quarter, half, full = widths
+    return sixteenth, eighth, quarter, half, full
