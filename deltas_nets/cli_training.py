@@ -1,5 +1,6 @@
 """The commands for those who build networks: `deltas train` and `deltas cost`."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,8 +19,9 @@ NETWORKS: tuple[Network, ...] = ("deltas-small", "deltas-resnet50", "deltas-vgg9
 class Train:
     """Train a network on procedural rooms.
 
-    Writes config.json, checkpoint.pt, weights.safetensors and log.jsonl into --out; a run that
-    was stopped goes on with --resume, or from weights alone with --init and --start-step.
+    Writes config.json, checkpoint.pt, weights.safetensors, log.jsonl and TensorBoard's curves into
+    --out; a run that was stopped goes on with --resume, or from weights alone with --init and
+    --start-step.
 
     Example: deltas train --out runs/first --steps 2000
 
@@ -53,7 +55,8 @@ class Train:
         """Do it."""
         from deltas_nets.checked_inputs import encoder_file
         from deltas_nets.train.checkpoint import load_config
-        from deltas_nets.train.fit import Start, fit
+        from deltas_nets.train.fit import fit
+        from deltas_nets.train.start import Start
 
         if self.resume and self.config != TRAIN_CONFIGS[self.preset]:
             raise UserError(
@@ -81,7 +84,8 @@ class Train:
             checkpoint_every=self.checkpoint_every,
             validate_every=self.validate_every,
         )
-        print(f"weights in {weights}")
+        if os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0":
+            print(f"weights in {weights}")
 
 
 @dataclass(frozen=True)

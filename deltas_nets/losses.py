@@ -13,6 +13,7 @@ from torch import Tensor
 
 from deltas_geom import Matches, PosedViews, Triangulation
 from deltas_nets.config import LossConfig
+from deltas_nets.counts import WHOLE, Counts
 from deltas_nets.network.deltas import DepthPrediction
 from deltas_nets.network.densifier import DenseDepth
 from deltas_nets.network.layers import upsample_like
@@ -43,8 +44,9 @@ def training_losses(
     config: LossConfig,
     *,
     depth_range: tuple[float, float],
+    counts: Counts = WHOLE,
 ) -> Losses:
-    """All terms for a batch.
+    """All terms for a batch, or for this process's part of one.
 
     Args:
         prediction: of the network, whose poses may have been noisy.
@@ -53,34 +55,38 @@ def training_losses(
         depth: ``(B, V, H, W)`` metres, 0 = unknown.
         config: weights of the terms.
         depth_range: as given to the network.
+        counts: how the number of places that a term is averaged over becomes that of the batch.
     """
     keypoints = prediction.keypoints
     targets = keypoint_targets(views, depth, keypoints.pixels, depth_range=depth_range)
     dense = prediction.evidence.dense
     truth = depth[:, :1]
-    coarse, fine = depth_terms(dense, truth, depth_range=depth_range, decay=config.scale_decay)
+    coarse, fine = depth_terms(
+        dense, truth, depth_range=depth_range, decay=config.scale_decay, counts=counts
+    )
     terms = {
         "detector": F.cross_entropy(keypoints.logits, detector_labels(images[:, 0])),
-        "match": match_loss(prediction.matches, targets),
-        "point": point_loss(prediction.points, targets),
+        "match": match_loss(prediction.matches, targets, counts=counts),
+        "point": point_loss(prediction.points, targets, counts=counts),
         "smoothness": smoothness_loss(prediction.depth, images[:, 0]),
         "depth": coarse,
         "gradient": fine,
-        "posterior": posterior_loss(prediction.evidence.posterior, targets),
-        "confidence": confidence_loss(prediction, targets),
-        "spread": spread_loss(dense, truth, depth_range=depth_range),
+        "posterior": posterior_loss(prediction.evidence.posterior, targets, counts=counts),
+        "confidence": confidence_loss(prediction, targets, counts=counts),
+        "spread": spread_loss(dense, truth, depth_range=depth_range, counts=counts),
     }
     total = sum((getattr(config, name) * term for name, term in terms.items()), truth.new_zeros(()))
     return Losses(**terms, total=total)
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+def masked_mean(values: Tensor, mask: Tensor, counts: Counts = WHOLE) -> Tensor:
     """Mean of the values where the mask holds; 0 where it holds nowhere."""
-    count = mask.sum()
-    return torch.where(mask, values, 0.0).sum() / count.clamp_min(1)
+    return torch.where(mask, values, 0.0).sum() / counts.divisor(mask.sum())
 
 
-def match_loss(matches: Matches, targets: Targets, *, cap: float = 6.0) -> Tensor:
+def match_loss(
+    matches: Matches, targets: Targets, *, cap: float = 6.0, counts: Counts = WHOLE
+) -> Tensor:
     """Smooth L1 between matched and true pixels of the sources, px (paper: L_2d).
 
     Beyond ``cap`` px a match is of another place altogether: pulling at it teaches nothing,
@@ -89,16 +95,19 @@ def match_loss(matches: Matches, targets: Targets, *, cap: float = 6.0) -> Tenso
     used = targets.visible[:, 1:] & matches.mask[:, 1:]
     error = (matches.pixels[:, 1:] - targets.pixels[:, 1:]).abs().sum(dim=-1)
     near = used & (error.detach() < cap)
-    return masked_mean(F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none"), near)
+    smooth = F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none")
+    return masked_mean(smooth, near, counts)
 
 
-def point_loss(points: Triangulation, targets: Targets, *, cap: float = 0.25) -> Tensor:
+def point_loss(
+    points: Triangulation, targets: Targets, *, cap: float = 0.25, counts: Counts = WHOLE
+) -> Tensor:
     """Smooth L1 between triangulated and true points, relative to depth (paper: L_3d)."""
     error = (points.points - targets.points).abs().sum(dim=-1)
     relative = error / torch.where(targets.known, targets.depth, 1.0)
     near = targets.known & points.valid & (relative.detach() < cap)
     smooth = F.smooth_l1_loss(relative, torch.zeros_like(relative), reduction="none", beta=0.02)
-    return masked_mean(smooth, near)
+    return masked_mean(smooth, near, counts)
 
 
 def smoothness_loss(depth: Tensor, image: Tensor) -> Tensor:
@@ -110,7 +119,12 @@ def smoothness_loss(depth: Tensor, image: Tensor) -> Tensor:
 
 
 def depth_terms(
-    dense: DenseDepth, depth: Tensor, *, depth_range: tuple[float, float], decay: float
+    dense: DenseDepth,
+    depth: Tensor,
+    *,
+    depth_range: tuple[float, float],
+    decay: float,
+    counts: Counts = WHOLE,
 ) -> tuple[Tensor, Tensor]:
     """Smooth L1 of log depth over four scales (paper: L_d), and L1 of its gradient.
 
@@ -130,30 +144,35 @@ def depth_terms(
             total = F.adaptive_avg_pool2d(truth * known, size)
             goal, mask = total / share.clamp_min(1e-6), share > 0.5
         error = F.smooth_l1_loss(predicted, goal, reduction="none", beta=0.02)
-        value = value + weight * masked_mean(error, mask)
+        value = value + weight * masked_mean(error, mask, counts)
         if scale < 2:
-            gradient = gradient + weight * _gradient_difference(predicted, goal, mask)
+            gradient = gradient + weight * _gradient_difference(predicted, goal, mask, counts)
         weight *= decay
     return value, gradient
 
 
-def _gradient_difference(predicted: Tensor, goal: Tensor, mask: Tensor) -> Tensor:
+def _gradient_difference(predicted: Tensor, goal: Tensor, mask: Tensor, counts: Counts) -> Tensor:
     across = masked_mean(
-        (predicted.diff(dim=-1) - goal.diff(dim=-1)).abs(), mask[..., 1:] & mask[..., :-1]
+        (predicted.diff(dim=-1) - goal.diff(dim=-1)).abs(), mask[..., 1:] & mask[..., :-1], counts
     )
     down = masked_mean(
-        (predicted.diff(dim=-2) - goal.diff(dim=-2)).abs(), mask[..., 1:, :] & mask[..., :-1, :]
+        (predicted.diff(dim=-2) - goal.diff(dim=-2)).abs(),
+        mask[..., 1:, :] & mask[..., :-1, :],
+        counts,
     )
     return across + down
 
 
-def posterior_loss(posterior: Posterior, targets: Targets, *, width: float = 0.6) -> Tensor:
+def posterior_loss(
+    posterior: Posterior, targets: Targets, *, width: float = 0.6, counts: Counts = WHOLE
+) -> Tensor:
     """Cross-entropy of every stage's posterior with a bump at the true inverse depth.
 
     Args:
         posterior: over inverse depth, joint or per view.
         targets: truth.
         width: standard deviation of the bump, in samples.
+        counts: as for :func:`training_losses`.
     """
     known = targets.known[:, None]
     true = (1 / torch.where(targets.known, targets.depth, 1.0))[:, None, :, None]
@@ -167,24 +186,29 @@ def posterior_loss(posterior: Posterior, targets: Targets, *, width: float = 0.6
     for number, logits in enumerate(posterior.stages):
         entropy = -(bump * logits.log_softmax(dim=-1)).sum(dim=-1)
         last = number == len(posterior.stages) - 1
-        total = total + (1.0 if last or number == 0 else 0.7) * masked_mean(entropy, inside)
+        total = total + (1.0 if last or number == 0 else 0.7) * masked_mean(entropy, inside, counts)
     return total
 
 
 def confidence_loss(
-    prediction: DepthPrediction, targets: Targets, *, tolerance: float = 0.05
+    prediction: DepthPrediction,
+    targets: Targets,
+    *,
+    tolerance: float = 0.05,
+    counts: Counts = WHOLE,
 ) -> Tensor:
     """Cross-entropy of a point's confidence with "its depth is right within 5 %"."""
     depth = prediction.points.depth[:, 0]
-    right = (depth - targets.depth).abs() < tolerance * targets.depth
+    right = ((depth - targets.depth).abs() < tolerance * targets.depth) & prediction.points.valid
     confidence = prediction.evidence.confidence.clamp(1e-4, 1 - 1e-4)
-    entropy = F.binary_cross_entropy(
-        confidence, (right & prediction.points.valid).float().detach(), reduction="none"
-    )
-    return masked_mean(entropy, targets.known)
+    # Not F.binary_cross_entropy: it raises for NaN, where a bad step is to be skipped.
+    entropy = -torch.where(right, confidence, 1 - confidence).log()
+    return masked_mean(entropy, targets.known, counts)
 
 
-def spread_loss(dense: DenseDepth, depth: Tensor, *, depth_range: tuple[float, float]) -> Tensor:
+def spread_loss(
+    dense: DenseDepth, depth: Tensor, *, depth_range: tuple[float, float], counts: Counts = WHOLE
+) -> Tensor:
     """Laplace negative log likelihood of the dense map's error under its own spread.
 
     The error is a constant here: doubt must not become a way to lower the depth loss.
@@ -193,7 +217,7 @@ def spread_loss(dense: DenseDepth, depth: Tensor, *, depth_range: tuple[float, f
     truth = torch.where(known, depth, 1.0).log()
     error = (upsample_like(dense.log_depth[0], truth) - truth).abs().detach()
     log_spread = upsample_like(dense.log_spread, truth)
-    return masked_mean(error * (-log_spread).exp() + log_spread, known)
+    return masked_mean(error * (-log_spread).exp() + log_spread, known, counts)
 
 
 def _known(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:

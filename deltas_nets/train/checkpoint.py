@@ -1,13 +1,18 @@
-"""The state of a training run in its folder, written so that a kill at any time loses little."""
+"""The state of a training run in its folder, written so that a kill at any time loses little.
+
+Every file is whole whenever it exists. The checkpoint is renamed into place last, so it never
+speaks of weights that are not there, and a run goes on from the last one that was finished.
+"""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import torch
 
-from deltas_nets.atomic_files import write_atomically, write_json
+from deltas_nets.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.config import TrainConfig, from_dict, to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
@@ -36,14 +41,6 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str)
         origin: what the weights started from, with its licence.
     """
     write_json(folder / CONFIG, to_dict(config))
-    content = {
-        "step": state.step,
-        "origin": origin,
-        "model": state.model.state_dict(),
-        "average": state.average.model.state_dict(),
-        "optimizer": state.optimizer.state_dict(),
-    }
-    write_atomically(folder / CHECKPOINT, lambda file: torch.save(content, file))
     average = state.average.model
     assert isinstance(average, Deltas)
     metadata = {
@@ -56,6 +53,28 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str)
         "train": json.dumps(to_dict(replace(config, data=replace(config.data, cache=None)))),
     }
     save_weights(folder / WEIGHTS, average, metadata)
+    content = {
+        "step": state.step,
+        "origin": origin,
+        "model": state.model.state_dict(),
+        "average": average.state_dict(),
+        "optimizer": state.optimizer.state_dict(),
+    }
+    write_atomically(folder / CHECKPOINT, lambda file: _save_durably(content, file))
+
+
+def _save_durably(content: dict[str, Any], file: IO[bytes]) -> None:
+    torch.save(content, file)
+    file.flush()
+    # Without it a power cut can leave the new name on an empty file.
+    os.fsync(file.fileno())
+
+
+def remove_half_written(folder: Path) -> None:
+    """Remove what a killed run was writing."""
+    for path in folder.iterdir():
+        if TEMPORARY.match(path.name):
+            path.unlink(missing_ok=True)
 
 
 def load_config(folder: Path) -> TrainConfig:

@@ -7,12 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.losses import inverse_depth_smoothness_loss
+from torch.nn.functional import binary_cross_entropy
 
 from deltas_geom import Matches, PosedViews, triangulate
 from deltas_nets.config import DetectorConfig, LossConfig, MatcherConfig, NetworkConfig
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import render_room
 from deltas_nets.losses import (
+    confidence_loss,
     depth_terms,
     match_loss,
     point_loss,
@@ -144,6 +146,31 @@ def test_kornias_smoothness_spares_edges_of_the_image() -> None:
     step[..., 4:] = 2.0
     flat, edge = torch.zeros(1, 3, 8, 8), step.expand(1, 3, 8, 8)
     assert inverse_depth_smoothness_loss(step, edge) < inverse_depth_smoothness_loss(step, flat)
+
+
+def test_confidence_costs_its_cross_entropy_and_hands_nan_on(room: PosedImages) -> None:
+    with torch.no_grad():
+        prediction = Deltas(NetworkConfig()).eval()(room.images, room.views)
+    pixels = prediction.keypoints.pixels
+    targets = keypoint_targets(room.views, room.depth, pixels, depth_range=RANGE)
+    factor = torch.linspace(0.9, 1.1, targets.depth.shape[-1])
+    points = prediction.points
+    depth = points.depth.clone()
+    depth[:, 0] = factor * targets.depth
+    valid = torch.arange(len(factor)) % 3 > 0
+    prediction = prediction._replace(points=points._replace(depth=depth, valid=valid[None]))
+    right = (((factor - 1).abs() < 0.05) & valid)[None]
+    confidence = torch.linspace(0.01, 0.99, right.numel()).view_as(right)
+    expected = binary_cross_entropy(
+        confidence[targets.known], right[targets.known].to(confidence.dtype)
+    )
+
+    def cost(confidence: torch.Tensor) -> torch.Tensor:
+        evidence = prediction.evidence._replace(confidence=confidence)
+        return confidence_loss(prediction._replace(evidence=evidence), targets)
+
+    torch.testing.assert_close(cost(confidence), expected)
+    assert cost(confidence * torch.nan).isnan()
 
 
 @pytest.mark.parametrize("kind", ["joint", "per_view"])

@@ -1,11 +1,14 @@
 """Training: ten steps and a prediction, batches by number, resume and start from weights."""
 
 import json
+import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from run_fit import assert_same_state, logged
 
 from deltas_geom import PosedViews, fundamental_between, in_image, project, unproject
 from deltas_nets import load_model
@@ -16,8 +19,11 @@ from deltas_nets.data.synthetic import Rooms, render_room
 from deltas_nets.errors import UserError
 from deltas_nets.targets import read_nearest
 from deltas_nets.train import fit as fit_module
-from deltas_nets.train.batches import BatchMaker, StepSampler, room_loader
-from deltas_nets.train.fit import Start, fit, learning_rate_factor
+from deltas_nets.train.batches import Batch, BatchMaker, Part, StepSampler, room_loader
+from deltas_nets.train.fit import Start, fit
+from deltas_nets.train.log import drop_later_entries
+from deltas_nets.train.optimiser import learning_rate_factor
+from deltas_nets.train.step import Stepper, StepResult
 
 CONFIG = TrainConfig(
     network=NetworkConfig(
@@ -41,7 +47,8 @@ def _small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def rooms() -> PosedImages:
-    return next(iter(room_loader(CONFIG, start=0, stop=1)))
+    rooms: PosedImages = next(iter(room_loader(CONFIG, start=0, stop=1)))
+    return rooms
 
 
 def with_batch(room: PosedImages) -> PosedImages:
@@ -83,35 +90,161 @@ def test_ten_steps_then_a_prediction(tmp_path: Path) -> None:
     assert "held-out rooms Abs Rel" in said[-1]
 
 
-def test_a_resumed_run_equals_an_unbroken_one(tmp_path: Path) -> None:
-    fit(CONFIG, tmp_path / "whole", Start())
-    half = replace(CONFIG)
-    fit(half, tmp_path / "broken", Start(), stop=5)
-    fit(half, tmp_path / "broken", Start(resume=True))
-    one = load_model(tmp_path / "whole" / "weights.safetensors").state_dict()
-    other = load_model(tmp_path / "broken" / "weights.safetensors").state_dict()
-    for name, tensor in one.items():
-        torch.testing.assert_close(other[name], tensor, rtol=1e-4, atol=1e-5)
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unbroken")
+    with pytest.MonkeyPatch.context() as patch:
+        few = Rooms(1, num_views=2, image_size=(48, 64))
+        patch.setattr(fit_module, "validation_rooms", lambda: few)
+        fit(CONFIG, folder, Start(), log_every=1)
+    return folder
 
 
-def test_a_run_stopped_by_hand_loses_no_step(
+def test_a_resumed_run_equals_an_unbroken_one(tmp_path: Path, unbroken: Path) -> None:
+    fit(CONFIG, tmp_path, Start(), stop=5, log_every=1)
+    fit(CONFIG, tmp_path, Start(resume=True), log_every=1)
+    assert_same_state(tmp_path, unbroken)
+    assert logged(tmp_path) == logged(unbroken)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_told_to_stop_finishes_its_step_and_goes_on_later(
+    tmp_path: Path, unbroken: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    take, calls = Stepper.__call__, []
+
+    def told_in_the_fourth(stepper: Stepper, batch: Batch, *, stop: bool) -> StepResult:
+        calls.append(stop)
+        if len(calls) == 4:
+            signal.raise_signal(number)
+        return take(stepper, batch, stop=stop)
+
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        patch.setattr(Stepper, "__call__", told_in_the_fourth)
+        with pytest.raises(KeyboardInterrupt):
+            fit(CONFIG, tmp_path, Start(), log_every=1)
+    assert signal.getsignal(number) == before
+    content = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert content["step"] == 5  # the next step's end is where all processes hear of it
+    fit(CONFIG, tmp_path, Start(resume=True), log_every=1)
+    assert_same_state(tmp_path, unbroken)
+
+
+def test_a_finished_run_has_nothing_left_to_do(tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=2)
+    weights = fit(config, tmp_path, Start())
+    before = weights.read_bytes(), (tmp_path / "log.jsonl").read_text()
+    assert fit(config, tmp_path, Start(resume=True)) == weights
+    assert (weights.read_bytes(), (tmp_path / "log.jsonl").read_text()) == before
+
+
+def test_a_run_killed_in_its_last_validation_makes_up_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    step, calls = fit_module._step, []
+    class Killed(BaseException):
+        pass
 
-    def stops_at_the_fourth(*arguments: object) -> object:
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return step(*arguments)  # type: ignore[arg-type]
+    def kill(model: object) -> dict[str, float]:
+        raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit_module, "_step", stops_at_the_fourth)
-        with pytest.raises(KeyboardInterrupt):
-            fit(CONFIG, tmp_path / "run", Start())
-    content = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
-    assert content["step"] == 3
-    fit(CONFIG, tmp_path / "run", Start(resume=True))
+        patch.setattr(fit_module, "validate", kill)
+        with pytest.raises(Killed):
+            fit(CONFIG, tmp_path, Start(), stop=2)
+    fit(CONFIG, tmp_path, Start(resume=True), stop=2)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "validation" in line] == [2]
+
+
+def poison(monkeypatch: pytest.MonkeyPatch, steps: set[int]) -> None:
+    """Make the images of some steps NaN."""
+    make = BatchMaker.__call__
+
+    def poisoned(maker: BatchMaker, rooms: PosedImages, step: int) -> Batch:
+        batch = make(maker, rooms, step)
+        bad = batch.images * torch.nan if step in steps else batch.images
+        return batch._replace(images=bad)
+
+    monkeypatch.setattr(BatchMaker, "__call__", poisoned)
+
+
+def test_a_step_without_a_usable_gradient_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit(CONFIG, tmp_path / "good", Start(), stop=3, log_every=1)
+    poison(monkeypatch, {3, 4})
+    fit(CONFIG, tmp_path / "bad", Start(), stop=5, log_every=1)
+    assert [entry["total"] for entry in logged(tmp_path / "bad")][3:] == ["nan", "nan"]
+    good, bad = (
+        torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("good", "bad")
+    )
+    assert (good["step"], bad["step"]) == (3, 5)
+    for part in ("model", "average"):  # the running statistics of batch norm among them
+        for name, tensor in good[part].items():
+            assert torch.equal(bad[part][name], tensor), f"{part} {name}"
+
+
+def test_training_that_diverges_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "PATIENCE", 3)
+    poison(monkeypatch, {0, 1, 3, 4, 5, 6, 7})
+    with pytest.raises(UserError, match=r"no usable gradient in the 3 steps up to 6.*lower --lear"):
+        fit(CONFIG, tmp_path, Start())
+
+
+def test_frozen_batch_norm_keeps_its_statistics(tmp_path: Path) -> None:
+    fit(replace(CONFIG, freeze_batch_norm=True), tmp_path, Start(), stop=2)
+    model = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["model"]
+    means = [tensor for name, tensor in model.items() if name.endswith("running_mean")]
+    variances = [tensor for name, tensor in model.items() if name.endswith("running_var")]
+    assert len(means) == len(variances) > 20
+    assert not any(mean.any() for mean in means)
+    assert all((variance == 1).all() for variance in variances)
+
+
+def test_bfloat16_leaves_weights_in_full_precision(tmp_path: Path) -> None:
+    fit(CONFIG, tmp_path / "full", Start(), stop=2, log_every=1)
+    fit(replace(CONFIG, precision="bf16-mixed"), tmp_path / "half", Start(), stop=2, log_every=1)
+    full, half = logged(tmp_path / "full")[0], logged(tmp_path / "half")[0]
+    assert half["total"] != full["total"]
+    assert half["total"] == pytest.approx(full["total"], rel=0.05)
+    content = torch.load(tmp_path / "half" / "checkpoint.pt", weights_only=True)
+    kinds = {tensor.dtype for tensor in content["model"].values() if tensor.is_floating_point()}
+    assert kinds == {torch.float32}
+
+
+def test_what_a_killed_run_logged_too_much_is_dropped(tmp_path: Path) -> None:
+    file = tmp_path / "log.jsonl"
+    lines = [json.dumps({"step": step, "total": 1.0}) for step in (20, 40, 60)]
+    file.write_text("\n".join(lines) + '\n{"step": 80, "tot')
+    drop_later_entries(file, 40)
+    assert file.read_text().splitlines() == lines[:2]
+    drop_later_entries(tmp_path / "none.jsonl", 40)
+    assert not (tmp_path / "none.jsonl").exists()
+
+
+def test_tensorboard_shows_every_step_once(tmp_path: Path) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    fit(CONFIG, tmp_path, Start(), stop=5, log_every=1, checkpoint_every=4)
+    # As if it had been killed after step 5, the last checkpoint being that of step 4.
+    content = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    torch.save({**content, "step": 4}, tmp_path / "checkpoint.pt")
+    fit(CONFIG, tmp_path, Start(resume=True), log_every=1)
+    found = events.EventAccumulator(str(tmp_path / "tensorboard"))
+    found.Reload()
+    tags = set(found.Tags()["scalars"])
+    assert {"loss/total", "loss/posterior", "training/rate", "validation/abs_rel"} <= tags
+    assert [scalar.step for scalar in found.Scalars("loss/total")] == list(range(1, 11))
+    assert [entry["step"] for entry in logged(tmp_path)] == list(range(1, 11))
+
+
+def test_without_tensorboard_there_is_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    fit(CONFIG, tmp_path, Start(), stop=1)
+    assert [entry["step"] for entry in logged(tmp_path)] == [1]
+    assert not (tmp_path / "tensorboard").exists()
 
 
 def test_weights_alone_continue_the_schedule(tmp_path: Path) -> None:
@@ -144,6 +277,28 @@ def test_steps_see_every_room_once_an_epoch_and_continue_anywhere() -> None:
         assert sorted(room for batch in epoch for room in batch) == list(range(6))
     assert whole[:3] != whole[3:]
     assert list(StepSampler(6, 2, seed=1, start=2, stop=5)) == whole[2:5]
+
+
+def test_parts_of_a_step_are_the_whole_step() -> None:
+    config = replace(CONFIG, batch_size=4)
+    whole_rooms = next(iter(room_loader(config, start=3, stop=4)))
+    whole = BatchMaker(config)(whole_rooms, 3)
+    parts = []
+    for half in (Part(0, 2), Part(1, 2)):
+        rooms = next(iter(room_loader(config, start=3, stop=4, part=half)))
+        parts.append(BatchMaker(config, half)(rooms, 3))
+    assert torch.equal(torch.cat([part.images for part in parts]), whole.images)
+    assert torch.equal(torch.cat([part.depth for part in parts]), whole.depth)
+    assert torch.equal(torch.cat([part.shift for part in parts]), whole.shift)
+    for name in ("views", "true_views"):
+        for field in ("K", "cam_from_world"):
+            pieces = [getattr(getattr(part, name), field) for part in parts]
+            assert torch.equal(torch.cat(pieces), getattr(getattr(whole, name), field))
+    for again, part in zip(whole.split(2), parts, strict=True):
+        assert torch.equal(again.images, part.images)
+        assert torch.equal(again.views.cam_from_world, part.views.cam_from_world)
+    # Rooms of a step differ in what is drawn for them.
+    assert len({float(shift) for shift in whole.shift[:, 0]}) == 4
 
 
 def test_a_step_is_a_function_of_its_number(rooms: PosedImages) -> None:

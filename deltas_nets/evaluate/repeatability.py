@@ -1,0 +1,153 @@
+"""Repeatability: does a detector find the same places of the scene in another view?
+
+A point of one view counts if the other view sees its place: its depth is known, it projects into
+the other image, and what is seen there has the depth that the point should have. It is repeated
+if a point of the other view that counts too lies within some pixels of its projection. The
+repeatability of a pair is symmetric:
+
+    (repeated points of the first + repeated points of the second) / (points that count)
+
+Sources: Schmid, Mohr and Bauckhage, Evaluation of interest point detectors (2000), for points of
+the common part of the scene; DeTone et al., SuperPoint (2018), appendix, for the symmetric share
+and for 3 px and 300 points. They relate images by homographies, we by depth and pose.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.subpix import nms2d
+from torch import Tensor
+
+from deltas_geom import PosedViews, in_image, project, unproject
+from deltas_geom.checks import check_shapes
+from deltas_nets.targets import read_nearest
+
+TOLERANCE = 3.0  # px
+NUM_POINTS = 300
+DEPTH_TOLERANCE = 0.05
+
+
+class Repeatability(NamedTuple):
+    """How two point sets of one scene agree.
+
+    Attributes:
+        repeated: points of either view with a partner in the other.
+        counted: points of either view whose place the other view sees.
+        error: mean distance between projection and partner of repeated points, px; NaN if none.
+    """
+
+    repeated: int
+    counted: int
+    error: float
+
+    @property
+    def share(self) -> float:
+        """Repeated of counted points, in [0, 1]; NaN where nothing counts."""
+        return self.repeated / self.counted if self.counted else float("nan")
+
+
+class _Seen(NamedTuple):
+    """Points of one view in the other.
+
+    Attributes:
+        pixels: ``(N, 2)``.
+        counts: ``(N,)`` bool.
+    """
+
+    pixels: Tensor
+    counts: Tensor
+
+
+def repeatability(
+    views: PosedViews,
+    depth: Tensor,
+    first: Tensor,
+    second: Tensor,
+    *,
+    tolerance: float = TOLERANCE,
+    depth_tolerance: float = DEPTH_TOLERANCE,
+) -> Repeatability:
+    """Compare the points found in two views of a scene.
+
+    Args:
+        views: the two cameras, K ``(2, 3, 3)``.
+        depth: ``(2, H, W)`` true depth along z, metres, 0 = unknown.
+        first: ``(N, 2)`` points found in view 0.
+        second: ``(M, 2)`` points found in view 1.
+        tolerance: farthest that a partner may be from the projection, px, itself included.
+        depth_tolerance: largest difference between the projected and the seen depth, as a
+            share of the projected one: beyond, the place is hidden, or its depth is wrong.
+
+    Raises:
+        ShapeError: a trailing shape differs.
+    """
+    check_shapes(depth=(depth, "2 H W"), first=(first, "N 2"), second=(second, "M 2"))
+    forth = _seen_by_other(views, depth, first, depth_tolerance)
+    back = _seen_by_other(views.select([1, 0]), depth.flip(0), second, depth_tolerance)
+    distances = torch.cat(
+        [
+            _to_partner(forth.pixels[forth.counts], second[back.counts]),
+            _to_partner(back.pixels[back.counts], first[forth.counts]),
+        ]
+    )
+    near = distances[distances <= tolerance]
+    return Repeatability(len(near), len(distances), float(near.mean()))
+
+
+def pooled(pairs: Sequence[Repeatability]) -> Repeatability:
+    """All pairs of views together: every point that counts weighs the same."""
+    repeated = sum(pair.repeated for pair in pairs)
+    total = sum(pair.error * pair.repeated for pair in pairs if pair.repeated)
+    error = total / repeated if repeated else float("nan")
+    return Repeatability(repeated, sum(pair.counted for pair in pairs), error)
+
+
+def strongest_points(
+    scores: Tensor, count: int = NUM_POINTS, *, nms_radius: int = 4, border: int = 4
+) -> Tensor:
+    """The best local maxima of a score map.
+
+    Args:
+        scores: ``(1, 1, H, W)``.
+        count: how many are wanted.
+        nms_radius: none is nearer to a stronger one than this, pixels along an axis.
+        border: none is nearer to the image border, pixels.
+
+    Returns:
+        ``(n, 2)`` whole pixels, strongest first; ``n <= count``.
+    """
+    check_shapes(scores=(scores, "1 H W"))
+    window = 2 * nms_radius + 1
+    peaks = nms2d(scores, (window, window))[0, 0]
+    height, width = peaks.shape
+    inner = torch.zeros_like(peaks)
+    rows, columns = slice(border, height - border), slice(border, width - border)
+    inner[rows, columns] = peaks[rows, columns]
+    values, index = inner.flatten().topk(min(count, inner.numel()))
+    index = index[values > 0]
+    row = index.div(width, rounding_mode="floor")
+    return torch.stack([index % width, row], dim=-1).to(scores.dtype)
+
+
+def _seen_by_other(
+    views: PosedViews, depth: Tensor, pixels: Tensor, depth_tolerance: float
+) -> _Seen:
+    """Where view 1 sees points of view 0, and whether it does."""
+    size = (depth.shape[-2], depth.shape[-1])
+    own = torch.where(in_image(pixels, image_size=size), read_nearest(depth[0], pixels), 0.0)
+    safe = torch.where(own > 0, own, 1.0)
+    points = unproject(views.select([0]), pixels[None], safe[None])[0]
+    other = project(views.select([1]), points)
+    there, expected = other.pixels[0], other.depth[0]
+    surface = read_nearest(depth[1], there)
+    # Of what is behind the camera, whose depth is negative, none is the same.
+    same = (surface > 0) & ((surface - expected).abs() <= depth_tolerance * expected)
+    return _Seen(there, (own > 0) & in_image(there, image_size=size) & same)
+
+
+def _to_partner(projected: Tensor, found: Tensor) -> Tensor:
+    """Distance ``(n,)`` of each projection to the nearest found point; infinite without any."""
+    if len(found) == 0:
+        return projected.new_full((len(projected),), torch.inf)
+    return torch.cdist(projected, found, compute_mode="donot_use_mm_for_euclid_dist").amin(dim=1)

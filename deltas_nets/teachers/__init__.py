@@ -1,0 +1,58 @@
+"""Detectors to distil from: score maps of networks that others trained.
+
+A teacher is used in training only; nothing of it is in the shipped weights but what the student
+learned. The paper's teacher is SuperPoint.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from torch import Tensor
+
+from deltas_nets.errors import UserError
+from deltas_nets.teachers.kornia_detectors import load_aliked, load_disk, load_xfeat
+from deltas_nets.teachers.superpoint import load_superpoint
+
+__all__ = ["LICENCES", "TEACHERS", "Teacher", "load_teacher"]
+
+
+class Teacher(Protocol):
+    """Anything that says how much of an interest point every pixel is."""
+
+    def __call__(self, images: Tensor, /) -> Tensor:
+        """Score map ``(B, 1, H, W)`` in [0, 1] of RGB images ``(B, 3, H, W)`` in [0, 1]."""
+        ...
+
+
+TEACHERS: dict[str, Callable[[Path], Teacher]] = {
+    "superpoint": load_superpoint,
+    "aliked": load_aliked,
+    "disk": load_disk,
+    "xfeat": load_xfeat,
+}
+"""What loads a teacher from a file, by name."""
+
+LICENCES = {
+    "superpoint": "as the file's authors say (the original: non-commercial research)",
+    "aliked": "BSD-3-Clause",
+    "disk": "Apache-2.0",
+    "xfeat": "Apache-2.0",
+}
+"""Licences of the published weights, recorded beside what was distilled from them."""
+
+
+def load_teacher(name: str, file: str | Path) -> Teacher:
+    """A teacher with the weights of a file, in evaluation mode.
+
+    Args:
+        name: superpoint, aliked, disk or xfeat.
+        file: its published weights.
+
+    Raises:
+        UserError: no such teacher, or the file holds something else; names the first key that
+            is missing.
+    """
+    if name not in TEACHERS:
+        raise UserError("no such teacher", name, f"use one of {', '.join(TEACHERS)}")
+    return TEACHERS[name](Path(file))

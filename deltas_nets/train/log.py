@@ -1,0 +1,152 @@
+"""What a run tells: a progress bar, a line of JSON every few steps, and TensorBoard's curves."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from deltas_nets.atomic_files import plain, write_atomically
+from deltas_nets.config import TrainConfig, to_dict
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+LOG = "log.jsonl"
+CURVES = "tensorboard"
+
+
+class RunLog:
+    """Says nothing: for all processes but the first."""
+
+    def __enter__(self) -> "RunLog":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Nothing is open."""
+
+    def progress(self, step: int) -> None:
+        """So many steps are done."""
+
+    def losses(
+        self, step: int, losses: Mapping[str, float], *, rate: float, seconds: float
+    ) -> None:
+        """The losses of a step, its learning rate and how long it took."""
+
+    def validation(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Metrics after a step."""
+
+
+class FolderLog(RunLog):
+    """Writes log.jsonl and, where the package tensorboard is installed, its event files.
+
+    Args:
+        folder: of the run.
+        config: recorded as text.
+        step: the run goes on after this one; what a killed run logged later is dropped.
+        report: where messages go.
+    """
+
+    def __init__(
+        self, folder: Path, config: TrainConfig, *, step: int, report: Callable[[str], None]
+    ) -> None:
+        file = folder / LOG
+        drop_later_entries(file, step)
+        self.report = report
+        self._file = file.open("a", encoding="utf-8")
+        self._curves = _curves(folder / CURVES, step)
+        if self._curves is not None:
+            text = json.dumps(to_dict(config), indent=2).replace("\n", "\n    ")
+            self._curves.add_text("config", f"    {text}", step)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[loss]}"),
+            TimeRemainingColumn(),
+        )
+        self._task = self._bar.add_task("training", total=config.steps, completed=step, loss="")
+
+    def __enter__(self) -> "FolderLog":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+        self._file.close()
+        if self._curves is not None:
+            self._curves.close()
+
+    def progress(self, step: int) -> None:
+        """Move the bar."""
+        self._bar.update(self._task, completed=step)
+
+    def losses(
+        self, step: int, losses: Mapping[str, float], *, rate: float, seconds: float
+    ) -> None:
+        """A line, a point on every curve, and the total beside the bar."""
+        self._write({"step": step, **losses, "rate": rate, "seconds": seconds})
+        self._draw("loss", losses, step)
+        self._draw("training", {"rate": rate, "seconds": seconds}, step)
+        self._bar.update(self._task, loss=f"loss {losses['total']:.3f}")
+
+    def validation(self, step: int, metrics: Mapping[str, float]) -> None:
+        """A line, a point on every curve, and a message."""
+        self._write({"step": step, "validation": metrics})
+        self._draw("validation", metrics, step)
+        self.report(f"step {step}: held-out rooms {_in_words(metrics)}")
+
+    def _write(self, entry: Mapping[str, object]) -> None:
+        print(json.dumps(plain(entry)), file=self._file, flush=True)
+
+    def _draw(self, group: str, values: Mapping[str, float], step: int) -> None:
+        if self._curves is not None:
+            for name, value in values.items():
+                self._curves.add_scalar(f"{group}/{name}", value, step)
+            self._curves.flush()
+
+
+def drop_later_entries(file: Path, step: int) -> None:
+    """Remove from a log what a killed run wrote after the step it resumes from.
+
+    Those steps are taken again. A line that the kill cut short goes as well.
+    """
+    if not file.exists():
+        return
+    kept = []
+    for line in file.read_text(encoding="utf-8").splitlines():
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            continue
+        if entry["step"] <= step:
+            kept.append(line + "\n")
+    content = "".join(kept).encode("utf-8")
+    write_atomically(file, lambda opened: opened.write(content))
+
+
+def _curves(folder: Path, step: int) -> "SummaryWriter | None":
+    """TensorBoard's writer; None where the package is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    # TensorBoard forgets what a killed run wrote after the step it resumes from.
+    return SummaryWriter(str(folder), purge_step=step + 1)
+
+
+def _in_words(metrics: Mapping[str, float]) -> str:
+    words = {"abs_rel": "Abs Rel", "delta1": "delta<1.25", "sparse": "median of points"}
+    return ", ".join(f"{words[name]} {value:.4f}" for name, value in metrics.items())

@@ -1,0 +1,81 @@
+"""What a run starts from: random weights, an encoder, a weights file or its own checkpoint."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from deltas_nets.config import TrainConfig
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.pretrained import load_weights, read_metadata
+from deltas_nets.train.average import RunningAverage
+from deltas_nets.train.batch_norm import prepare_batch_norm
+from deltas_nets.train.checkpoint import RunState, load_run
+from deltas_nets.train.optimiser import make_optimizer
+from deltas_nets.train.step import unreached
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a run starts from.
+
+    Attributes:
+        encoder: an EfficientNet-Lite0 checkpoint for the encoder.
+        init: a weights file for the whole network.
+        step: the first step, for a schedule that goes on from ``init``.
+        resume: go on from the checkpoint in the run's folder.
+    """
+
+    encoder: Path | None = None
+    init: Path | None = None
+    step: int = 0
+    resume: bool = False
+
+
+class Started(NamedTuple):
+    """A run about to take its next step.
+
+    Attributes:
+        state: on this process's device.
+        origin: what the weights started from, with its licence.
+    """
+
+    state: RunState
+    origin: str
+
+
+def starting_state(config: TrainConfig, folder: Path, start: Start, fabric: "Fabric") -> Started:
+    """Network, average and optimizer, the same in every process.
+
+    Raises:
+        UserError: a file to start from is missing or does not fit.
+    """
+    torch.manual_seed(config.seed)
+    model = Deltas(config.network)
+    origin = "random weights"
+    if start.encoder is not None:
+        model.encoder.load_pretrained(start.encoder)
+        origin = "encoder from EfficientNet-Lite0 (Apache-2.0)"
+    if start.init is not None:
+        if not start.init.is_file():
+            raise UserError("no such weights", start.init, "name a .safetensors file with --init")
+        origin = read_metadata(start.init).get("origin", "unknown weights")
+        load_weights(model, start.init)
+    if fabric.world_size > 1:
+        parameters = dict(model.named_parameters())
+        for name in unreached(model, config):
+            parameters[name].requires_grad_(False)
+    # On the device before anything copies the weights or keeps state beside them.
+    fabric.to_device(model)
+    average = RunningAverage(model, config.average)
+    optimizer = make_optimizer(model, config)
+    state = RunState(model, average, optimizer, start.step)
+    if start.resume:
+        state, origin = load_run(folder, state)
+    prepare_batch_norm(model, config, processes=fabric.world_size)
+    return Started(state, origin)

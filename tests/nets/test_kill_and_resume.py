@@ -1,0 +1,35 @@
+"""SIGKILL in the middle of a checkpoint costs the steps since the last one, and nothing else."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from run_fit import CONFIG, assert_same_state, launch, logged, read_checkpoint, train
+
+from deltas_nets.train.fit import Start
+
+HALF_WRITTEN = ".checkpoint.pt.*.deltas-tmp"
+
+
+def test_a_run_killed_while_it_writes_a_checkpoint_ends_as_an_unbroken_one(tmp_path: Path) -> None:
+    unbroken, killed = tmp_path / "unbroken", tmp_path / "killed"
+    process = launch(killed, CONFIG, "half=6")
+    train(unbroken, CONFIG, Start())
+    deadline = time.monotonic() + 60
+    while not (killed / "writing").exists():
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()[0]
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+
+    # It had reached step 6; what is whole is the checkpoint of step 3.
+    (half,) = killed.glob(HALF_WRITTEN)
+    assert half.stat().st_size > 1_000_000
+    assert read_checkpoint(killed)["step"] == 3
+    assert [entry["step"] for entry in logged(killed)] == [1, 2, 3, 4, 5, 6]
+
+    train(killed, CONFIG, Start(resume=True))
+    assert_same_state(killed, unbroken)
+    assert logged(killed) == logged(unbroken)
+    assert not list(killed.glob(".*"))
