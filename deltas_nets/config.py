@@ -25,6 +25,9 @@ class DetectorConfig:
     """Detections are at least this far apart, pixels (the paper: 9 at 240 x 320)."""
     border: int = 2
     """Nothing is detected nearer to the image border, pixels."""
+    fine_width: int = 0
+    """Channels of the branch at half the image's resolution, which says where in its cell a point
+    is; 0 is none."""
 
     def __post_init__(self) -> None:
         if self.num_keypoints < 8:

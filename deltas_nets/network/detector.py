@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from deltas_nets.config import DetectorConfig
 from deltas_nets.network.encoder import CHANNELS, Features
-from deltas_nets.network.layers import ConvBlock, upsample_like
+from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
 
 CELL = 8
 """Side of a detector cell, pixels."""
@@ -33,6 +33,36 @@ class Keypoints(NamedTuple):
     logits: Tensor
 
 
+class FineLogits(nn.Module):
+    """Where in its cell a point is, seen at half the image's resolution.
+
+    A feature at 1/8 has to name one of 64 pixels; here every pixel is judged by the same
+    convolutions, so what is learned at one place holds at all. Starts as no correction.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.convs = nn.Sequential(
+            ConvBlock(int(CHANNELS.fine), width),
+            ConvBlock(width, width),
+            ConvBlock(width, width),
+            zero_initialised(nn.Conv2d(width, 4, 1)),
+        )
+
+    def forward(self, fine: Tensor, *, like: Tensor) -> Tensor:
+        """Corrections of the 65 logits; "none" has 0.
+
+        Args:
+            fine: ``(B, 16, ceil(H/2), ceil(W/2))``.
+            like: ``(B, 65, h, w)`` the logits.
+        """
+        pixels = F.pixel_shuffle(self.convs(fine).float(), 2)
+        rows, columns = CELL * like.shape[-2], CELL * like.shape[-1]
+        missing = (0, columns - pixels.shape[-1], 0, rows - pixels.shape[-2])
+        cells = F.pixel_unshuffle(F.pad(pixels, missing), CELL)
+        return F.pad(cells, (0, 0, 0, 0, 0, 1))
+
+
 class Detector(nn.Module):
     """Head on the anchor's features, and the choice of N points."""
 
@@ -43,6 +73,7 @@ class Detector(nn.Module):
         self.head = nn.Sequential(
             ConvBlock(48 + int(CHANNELS.eighth), 64), nn.Conv2d(64, CELL * CELL + 1, 1)
         )
+        self.fine = FineLogits(config.fine_width) if config.fine_width else None
 
     def forward(
         self,
@@ -63,6 +94,8 @@ class Detector(nn.Module):
         anchor = features.of_anchor()
         coarse = upsample_like(self.coarse(anchor.sixteenth), anchor.eighth)
         logits = self.head(torch.cat([coarse, anchor.eighth], dim=1)).float()
+        if self.fine is not None:
+            logits = logits + self.fine(anchor.fine, like=logits)
         return choose_keypoints(
             logits, self.config, image_size=image_size, num_keypoints=num_keypoints, shift=shift
         )

@@ -11,7 +11,7 @@ The paper distils from SuperPoint in the same way (section 3.1).
 import math
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -65,6 +65,8 @@ class DistillConfig:
     """What the student learns: how good every point is, or where the points are."""
     gain: float = 1.0
     """soft: factor of the teacher's scores, where they are small."""
+    fine_width: int = 16
+    """Width of the detector's fine branch, if the network has none yet; 0 adds none."""
     threshold: float = 0.1
     """hard: weaker points of the teacher are none."""
     cache: Path | None = None
@@ -107,13 +109,26 @@ def distill(config: DistillConfig, *, report: Callable[[str], None] = print) -> 
     teacher = load_teacher(config.teacher, config.teacher_weights)
     source = weights_file(config.init)
     model = load_model(config.init)
-    if not isinstance(model.encoder, Encoder):
+    encoder = model.encoder
+    if not isinstance(encoder, Encoder):
         raise UserError("only deltas-small has a detector to distil into", source, "use --init")
-    lessons = prepare(model.encoder, teacher, config, report=report)
+    if config.fine_width and not model.config.detector.fine_width:
+        model = with_fine_branch(model, config)
+    lessons = prepare(encoder, teacher, config, report=report)
     train_detector(model, lessons, config, report=report)
     save_weights(config.out, model, _record(config, read_metadata(source)))
     report(f"weights in {config.out}")
     return config.out
+
+
+def with_fine_branch(model: Deltas, config: DistillConfig) -> Deltas:
+    """The same network with a new branch in its detector, which changes nothing yet."""
+    detector = replace(model.config.detector, fine_width=config.fine_width)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        wider = Deltas(replace(model.config, detector=detector))
+    wider.load_state_dict(model.state_dict(), strict=False)
+    return wider.eval()
 
 
 def draw_pictures(config: DistillConfig) -> Iterator[Tensor]:

@@ -250,3 +250,20 @@ def test_exchange_without_learned_correction_sharpens_agreement() -> None:
     stages = context(logits, torch.zeros(1, 6, 8), torch.rand(1, 6, 2))
     assert stages[0][0, 0].argmax() == 11
     assert stages[-1][0, 0].argmax() == 4
+
+
+def test_the_detectors_fine_branch_starts_as_no_correction_and_then_moves_points_alone() -> None:
+    config = NetworkConfig(detector=DetectorConfig(fine_width=8))
+    torch.manual_seed(0)
+    model = Deltas(config).eval()
+    features = model.encoder(torch.rand(1, 1, 3, 50, 70))  # neither side a multiple of 8
+    with torch.no_grad():
+        before = model.detector(features, image_size=(50, 70)).logits
+        assert model.detector.fine is not None
+        plain, model.detector.fine = model.detector.fine, None
+        assert torch.equal(before, model.detector(features, image_size=(50, 70)).logits)
+        model.detector.fine = plain
+        torch.nn.init.ones_(plain.convs[-1].weight)
+        after = model.detector(features, image_size=(50, 70)).logits
+    assert after.shape == before.shape and not torch.equal(after[:, :-1], before[:, :-1])
+    assert torch.equal(after[:, -1], before[:, -1])
