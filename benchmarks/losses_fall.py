@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from deltas_nets.config import TRAIN_CONFIGS, DataConfig, TrainConfig
-from deltas_nets.losses import Losses, training_losses
+from deltas_nets.losses import Losses
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.train.batches import BatchMaker, room_loader
 from deltas_nets.train.optimiser import make_optimizer, set_learning_rate
+from deltas_nets.train.step import Objective
 
 FIVE = ("detector", "match", "point", "smoothness", "depth")
-DEPTH_RANGE = (0.5, 10.0)
 HELD_OUT = 8  # batches, of rooms whose seeds no training uses
 
 
@@ -46,34 +46,14 @@ def losses_of(model: Deltas, config: TrainConfig) -> dict[str, float]:
     held_out = dataclasses.replace(
         config, data=dataclasses.replace(config.data, seed=500, num_rooms=4 * HELD_OUT)
     )
+    objective = Objective(model, held_out)
     maker, total = BatchMaker(held_out), dict.fromkeys(FIVE, 0.0)
     with torch.no_grad():
         for step, rooms in enumerate(room_loader(held_out, start=0, stop=HELD_OUT)):
-            losses = _losses(model, maker, rooms, step, held_out)
+            losses: Losses = objective(maker(rooms, step))
             for name in FIVE:
                 total[name] += float(getattr(losses, name)) / HELD_OUT
     return total
-
-
-def _losses(
-    model: Deltas, maker: BatchMaker, rooms: object, step: int, config: TrainConfig
-) -> Losses:
-    batch = maker(rooms, step)  # type: ignore[arg-type]
-    prediction = model(
-        batch.images,
-        batch.views,
-        DEPTH_RANGE,
-        num_keypoints=config.num_keypoints,
-        shift=batch.shift,
-    )
-    return training_losses(
-        prediction,
-        batch.images,
-        batch.true_views,
-        batch.depth,
-        config.loss,
-        depth_range=DEPTH_RANGE,
-    )
 
 
 def main() -> None:
@@ -89,9 +69,10 @@ def main() -> None:
     model = Deltas(config.network)
     before = losses_of(model.train(), config)
     optimizer, maker = make_optimizer(model, config), BatchMaker(config)
+    objective = Objective(model, config)
     for step, rooms in enumerate(room_loader(config, start=0, stop=config.steps)):
         set_learning_rate(optimizer, step, config)
-        total: Tensor = _losses(model, maker, rooms, step, config).total
+        total: Tensor = objective(maker(rooms, step)).total
         optimizer.zero_grad()
         total.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip_gradient)
