@@ -1,4 +1,4 @@
-"""From rooms as rendered to what a training step sees."""
+"""From rooms as rendered, or frames as read, to what a training step sees."""
 
 import torch
 import torch.nn.functional as F
@@ -6,7 +6,9 @@ from kornia.augmentation import (
     RandomGamma,
     RandomGaussianBlur,
     RandomGaussianNoise,
+    RandomJPEG,
     RandomLinearIllumination,
+    RandomMotionBlur,
     RandomRGBShift,
     RandomSaturation,
 )
@@ -24,6 +26,12 @@ def choose_views(batch: PosedImages, num_views: int, generator: torch.Generator)
     row = torch.arange(count)[:, None]
     views = PosedViews(batch.views.K[row, order], batch.views.cam_from_world[row, order])
     return PosedImages(batch.images[row, order], views, batch.depth[row, order])
+
+
+def first_views(batch: PosedImages, num_views: int) -> PosedImages:
+    """The anchor and the first of its sources: ``(B, num_views, ...)``."""
+    views = PosedViews(*(tensor[:, :num_views] for tensor in batch.views))
+    return PosedImages(batch.images[:, :num_views], views, batch.depth[:, :num_views])
 
 
 def mirror(batch: PosedImages, flips: Tensor) -> PosedImages:
@@ -70,12 +78,14 @@ class Photometry(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.steps = nn.Sequential(
-            RandomGamma(gamma=(0.65, 1.5), gain=(0.75, 1.25), p=1.0),
+            RandomGamma(gamma=(0.65, 1.5), gain=(0.65, 1.45), p=1.0),
             RandomRGBShift(0.07, 0.05, 0.07, p=0.7),
             RandomSaturation((0.3, 1.3), p=0.5),
             RandomLinearIllumination(gain=(0.01, 0.25), p=0.3),
             RandomGaussianBlur((5, 5), (0.3, 1.2), p=0.3),
+            RandomMotionBlur((3, 9), angle=180.0, direction=(-0.3, 0.3), p=0.25),
             RandomGaussianNoise(0.0, 0.015, p=0.7),
+            RandomJPEG(jpeg_quality=(40.0, 95.0), p=0.3),
         )
 
     def forward(self, images: Tensor, seed: int) -> Tensor:

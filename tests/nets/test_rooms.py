@@ -16,7 +16,8 @@ from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms, draw_room, render_room, texture_atlas
 from deltas_nets.data.synthetic.cast import cast_rays
 from deltas_nets.data.synthetic.furniture import BOX, CYLINDER, ELLIPSOID
-from deltas_nets.data.synthetic.scene import Solids
+from deltas_nets.data.synthetic.render import _mirror_image, render_view
+from deltas_nets.data.synthetic.scene import Room, Solids
 from deltas_nets.data.synthetic.textures import (
     GROUNDS,
     LEVEL_SIZES,
@@ -162,6 +163,118 @@ def test_the_view_from_inside_along_the_axis_of_a_cylinder_is_finite() -> None:
     assert depth.isfinite().all()
     assert solid[4, 4] == 1 and depth[4, 4] == 1.0  # the cap
     assert solid[0, 0] == 0 and depth[0, 0] == 5.0  # the floor
+
+
+# Mirrors
+
+
+def polished(seed: int, *, gloss: float) -> tuple[Room, PosedViews]:
+    """A room whose floor mirrors; nothing else does, and the lens is sharp."""
+    room, views = draw_room(seed, num_views=1, image_size=SIZE, kinds=texture_atlas().kinds)
+    shares = torch.zeros_like(room.surfaces.gloss)
+    shares[0, 3] = gloss
+    smooth = torch.full_like(room.surfaces.roughness, 1e-4)
+    surfaces = room.surfaces._replace(gloss=shares, roughness=smooth)
+    return room._replace(surfaces=surfaces, blur=0.01), views
+
+
+def floor_seed() -> int:
+    """A seed whose camera sees much of the floor."""
+    for seed in range(20):
+        room, views = polished(seed, gloss=0.5)
+        hits = cast_rays(room.solids, views.K[0], views.cam_from_world[0], image_size=SIZE)
+        height = floor_height(hits.depth, views)
+        if ((height.abs() < 1e-3) & (hits.solid == 0)).float().mean() > 0.2:
+            return seed
+    raise AssertionError("no room shows its floor")
+
+
+def floor_height(depth: Tensor, views: PosedViews) -> Tensor:
+    """World y of what each pixel sees."""
+    return world_points(depth, views)[1].view(SIZE)
+
+
+def world_points(depth: Tensor, views: PosedViews) -> Tensor:
+    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
+    pixels = torch.stack([x, y], dim=-1).flatten(0, 1).float()
+    return unproject(views, pixels[None], depth.flatten()[None])[0].T
+
+
+def test_a_mirror_keeps_its_own_depth() -> None:
+    atlas = texture_atlas()
+    for seed in SEEDS:
+        room, views = draw_room(seed, num_views=1, image_size=SIZE, kinds=atlas.kinds)
+        matte = room.surfaces._replace(gloss=torch.zeros_like(room.surfaces.gloss))
+        camera = views.K[0], views.cam_from_world[0]
+        _, depth = render_view(room, atlas, *camera, image_size=SIZE)
+        _, expected = render_view(room._replace(surfaces=matte), atlas, *camera, image_size=SIZE)
+        assert torch.equal(depth, expected)
+
+
+def test_a_polished_floor_shows_what_stands_at_the_end_of_the_reflected_ray() -> None:
+    """An oracle: walk along each reflected ray and ask whether it is inside a solid."""
+    room, views = polished(floor_seed(), gloss=0.5)
+    K, cam_from_world = views.K[0], views.cam_from_world[0]
+    hits = cast_rays(room.solids, K, cam_from_world, image_size=SIZE)
+    mirrored = cam_from_world @ _mirror_image(room, 3)
+    seen = cast_rays(room.solids, K, mirrored, image_size=SIZE, beyond=hits.depth + 1e-3)
+    points = world_points(hits.depth, views).double()
+    on_floor = (points[1].abs() < 1e-3) & (hits.solid.flatten() == 0)
+    centre = -cam_from_world[:3, :3].mT.double() @ cam_from_world[:3, 3:].double()
+    onward = (points - centre) * torch.tensor([[1.0], [-1], [1]])  # off the floor y = 0
+    # The ray's parameter goes on from the mirror: at twice its depth, as far again.
+    ratio = (seen.depth / hits.depth).flatten().double() - 1
+    met = points + ratio * onward
+    reached = extent(room.solids, met).gather(0, seen.solid.flatten()[None])[0]
+    smallest = room.solids.half_size[seen.solid.flatten()].amin(dim=1)
+    assert ((reached - 1).abs() * smallest)[on_floor].max() < 1e-3  # m
+    for share in torch.linspace(0.02, 0.995, 40).tolist():
+        before = extent(room.solids, points + share * ratio * onward)[1:, on_floor]
+        assert (before < 1 - 1e-2).sum() == 0
+
+
+def test_a_polished_floor_is_the_matte_floor_and_a_share_of_the_mirrored_light() -> None:
+    atlas = texture_atlas()
+    seed = floor_seed()
+    images = []
+    for gloss in (0.0, 0.2, 0.4):
+        room, views = polished(seed, gloss=gloss)
+        dark = room._replace(light=room.light._replace(lamp=torch.zeros(3)))  # no highlight
+        image, depth = render_view(dark, atlas, *(t[0] for t in views), image_size=SIZE)
+        images.append(image)
+    matte, little, much = images
+    floor = floor_height(depth, views).abs() < 1e-3
+    assert torch.equal(matte[:, ~floor], much[:, ~floor])
+    gained = (little - matte)[:, floor]
+    assert (gained > 0).float().mean() > 0.9
+    # Schlick: the share is linear in the gloss, g + (1 - g) k.
+    twice = (much - matte)[:, floor]
+    assert (twice <= 2 * gained + 1e-5).all() and (twice >= gained - 1e-5).all()
+
+
+def test_reflections_do_not_stay_on_the_surface() -> None:
+    """Read at the surface's true depth, a mirror's colours of two views disagree."""
+    gloss = [compare_floor(floor_seed(), share) for share in (0.0, 0.6)]
+    assert gloss[1] > 1.5 * gloss[0]
+
+
+def compare_floor(seed: int, gloss: float) -> Tensor:
+    """Mean difference of colour between two views of the floor's own points."""
+    atlas = texture_atlas()
+    room, views = polished(seed, gloss=gloss)
+    aside = views.cam_from_world[0].clone()
+    aside[0, 3] += 0.2
+    first, depth = render_view(room, atlas, views.K[0], views.cam_from_world[0], image_size=SIZE)
+    second, other = render_view(room, atlas, views.K[0], aside, image_size=SIZE)
+    pair = PosedViews(views.K.expand(2, 3, 3), torch.stack([views.cam_from_world[0], aside]))
+    item = PosedImages(
+        (torch.stack([first, second]).clamp(0, 1) * 255).round().to(torch.uint8),
+        pair,
+        torch.stack([depth, other]),
+    )
+    ratio, difference, inside = compare(item, anchor=0, source=1)
+    floor = (floor_height(depth, views).abs() < 1e-3).flatten()
+    return difference[inside & floor & ((ratio - 1).abs() < 0.01)].mean()
 
 
 # Textures

@@ -43,7 +43,12 @@ def pixel_rays(K: Tensor, *, image_size: tuple[int, int]) -> tuple[Tensor, Tenso
 
 
 def cast_rays(
-    solids: Solids, K: Tensor, cam_from_world: Tensor, *, image_size: tuple[int, int]
+    solids: Solids,
+    K: Tensor,
+    cam_from_world: Tensor,
+    *,
+    image_size: tuple[int, int],
+    beyond: Tensor | float = NEAR,
 ) -> Hits:
     """Nearest solid along the ray of every pixel; solid 0 is seen from inside.
 
@@ -53,8 +58,12 @@ def cast_rays(
         solids: N of them.
         K: ``(3, 3)``, without skew.
         image_size: height, width.
-        cam_from_world: ``(4, 4)``; the camera stands inside solid 0 and outside the others.
+        cam_from_world: ``(4, 4)``; the camera stands inside solid 0 and outside the others, or
+            is the image of such a camera in a mirror.
+        beyond: metres along z, a number or ``(H, W)``: nothing nearer is seen. For a mirrored
+            camera the mirror's own depth, since its rays begin there.
     """
+    nearest = torch.as_tensor(beyond, dtype=K.dtype, device=K.device).expand(image_size)
     ray_x, ray_y = pixel_rays(K, image_size=image_size)
     turn, shift = cam_from_world[:3, :3], cam_from_world[:3, 3]
     unit_from_world = solids.local_from_world / solids.half_size[..., None]
@@ -78,7 +87,8 @@ def cast_rays(
             depth.copy_(leave)
             continue
         window = depth[top:bottom, left:right]
-        hit = (enter < leave) & (enter > NEAR) & (enter < window)
+        begin = nearest[top:bottom, left:right]
+        hit = (enter < leave) & (enter > begin) & (enter < window)
         window.copy_(torch.where(hit, enter, window))
         index[top:bottom, left:right].masked_fill_(hit, n)
     return Hits(depth, index)

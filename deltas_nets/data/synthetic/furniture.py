@@ -122,13 +122,24 @@ def hanging_lamp(rng: np.random.Generator) -> list[Solid]:
     w, h, bottom = rng.uniform((0.08, 0.05, 1.6), (0.35, 0.2, 2.3))
     shape = int(rng.choice((BOX, ELLIPSOID, CYLINDER)))
     cord = cylinder(0.0, 0.0, 0.008, (-4.0, -bottom), "metal")
-    return [cord, _between(shape, (-w, w), (-bottom - h, -bottom), (-w, w), "clutter")]
+    shade = "window" if rng.random() < 0.4 else "clutter"  # alight, or not
+    return [cord, _between(shape, (-w, w), (-bottom - h, -bottom), (-w, w), shade)]
 
 
 def plant(rng: np.random.Generator) -> list[Solid]:
-    """A pot and leafy blobs."""
+    """A pot with leafy blobs, or with long leaves on all sides."""
     pot, h = rng.uniform((0.1, 0.2), (0.22, 0.5))
     solids = [cylinder(0.0, 0.0, pot, (-h, 0.0), "clutter")]
+    if rng.random() < 0.5:
+        stem = rng.uniform(0.2, 1.0)
+        solids.append(cylinder(0.0, 0.0, 0.02, (-h - stem, -h), "foliage"))
+        for _ in range(rng.integers(8, 25)):
+            length, width = rng.uniform((0.12, 0.015), (0.35, 0.04))
+            turn = rotation(yaw=rng.uniform(-np.pi, np.pi), pitch=rng.uniform(-0.6, 1.2))
+            root = np.array([0.0, -h - rng.uniform(0.2, 1.0) * stem, 0.0])
+            half = np.array([width, 0.006, length])
+            solids.append(Solid(ELLIPSOID, root + turn[:, 2] * length, half, turn, "foliage"))
+        return solids
     for _ in range(rng.integers(2, 6)):
         x, y, z = rng.uniform((-0.2, -h - 0.9, -0.2), (0.2, -h - 0.1, 0.2))
         half = rng.uniform(0.04, 0.25, 3)
@@ -148,12 +159,33 @@ def poster(rng: np.random.Generator) -> list[Solid]:
     """A picture, screen or window hung on a wall, sometimes in a frame."""
     w, h = np.exp(rng.uniform(np.log(0.12), np.log(0.8), 2))
     middle, thick = -rng.uniform(1.1, 1.8), rng.uniform(0.005, 0.06)
-    solids = [box((-w, w), (middle - h, middle + h), (-thick, 0.0), "picture")]
+    material = str(rng.choice(("picture", "picture", "screen", "window")))
+    solids = [box((-w, w), (middle - h, middle + h), (-thick, 0.0), material)]
     if rng.random() < 0.5:
         rim = rng.uniform(0.01, 0.05)
         back = ((-w - rim, w + rim), (middle - h - rim, middle + h + rim), (-0.8 * thick, 0.0))
         solids.append(box(*back, "furniture"))
     return solids
+
+
+def kitchen(rng: np.random.Generator) -> list[Solid]:
+    """Cupboards below and above a worktop, a smooth panel between them, things on the top."""
+    w, d, h = rng.uniform((0.6, 0.25, 0.8), (1.6, 0.32, 0.95))
+    low, high = h + rng.uniform(0.4, 0.6), rng.uniform(1.9, 2.3)
+    solids = [
+        box((-w, w), (-h, 0.0), (-d, d), "cabinet"),
+        box((-w - 0.01, w + 0.01), (-h - 0.04, -h), (-d - 0.02, d), "furniture"),
+        box((-w, w), (-low, -h - 0.04), (d - 0.02, d), "panel"),
+    ]
+    shelf_depth = rng.uniform(0.0, 0.5) * d
+    solids.append(box((-w, w), (-high, -low), (shelf_depth, d), "cabinet"))
+    count = int(rng.integers(1, 4))
+    for x in np.linspace(-w, w, count + 2)[1:-1]:  # handles
+        handle = (float(x) - 0.06, float(x) + 0.06)
+        solids.append(box(handle, (-h + 0.1, -h + 0.12), (-d - 0.03, -d), "metal"))
+        bar = (shelf_depth - 0.03, shelf_depth)
+        solids.append(box(handle, (-low - 0.12, -low - 0.1), bar, "metal"))
+    return solids + clutter_on(rng, int(rng.integers(1, 5)), w, d - 0.05, -h - 0.04)
 
 
 def door(rng: np.random.Generator) -> list[Solid]:

@@ -1,18 +1,22 @@
-"""Pictures of a room: cast the rays, then shade what they hit, one view at a time."""
+"""Pictures of a room: cast the rays, shade what they hit, and add what polished faces mirror."""
+
+import math
 
 import torch
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn import functional as F
 
-from deltas_nets.data.synthetic.cast import Hits, cast_rays, pixel_rays
-from deltas_nets.data.synthetic.furniture import BOX, CYLINDER
+from deltas_nets.data.synthetic.cast import Hits, cast_rays
+from deltas_nets.data.synthetic.furniture import BOX
 from deltas_nets.data.synthetic.scene import Room
-from deltas_nets.data.synthetic.textures import (
-    LEVEL_SIZES,
-    TEXELS_PER_TEXTURE,
-    TEXTURE_SIZE,
-    Atlas,
-)
+from deltas_nets.data.synthetic.shade import Shaded, shade
+from deltas_nets.data.synthetic.textures import Atlas
+
+MAX_MIRRORS = 6
+"""Faces of a view that mirror, the largest ones."""
+SMALLEST_MIRROR = 0.004
+"""Share of the image below which a face does not mirror."""
+LONGEST_BLUR = 8.0  # pixels
 
 
 @torch.no_grad()
@@ -35,159 +39,78 @@ def render_view(
 
     Returns:
         Radiance ``(3, H, W)``, not negative, before exposure; and depth ``(H, W)``,
-        metres along z at the pixel centres, exact.
+        metres along z at the pixel centres, exact: of the surface itself where it mirrors.
     """
     hits = cast_rays(room.solids, K, cam_from_world, image_size=image_size)
-    radiance = _shade(room, atlas, hits, K, cam_from_world)
-    return _blur(radiance.view(3, *image_size), room.blur), hits.depth
+    shaded = shade(room, atlas, hits, K, cam_from_world)
+    radiance = shaded.radiance.view(3, *image_size).clone()
+    _add_reflections(radiance, room, atlas, hits, shaded, K, cam_from_world)
+    return _blur(radiance, room.blur), hits.depth
 
 
-def _shade(room: Room, atlas: Atlas, hits: Hits, K: Tensor, cam_from_world: Tensor) -> Tensor:
-    """Light that each pixel's point sends to the camera, ``(3, H * W)``."""
-    solids, surfaces, light = room.solids, room.surfaces, room.light
-    turn = cam_from_world[:3, :3]
-    camera = -turn.mT @ cam_from_world[:3, 3]
-    ray_x, ray_y = pixel_rays(K, image_size=(hits.depth.shape[0], hits.depth.shape[1]))
-    ray = torch.stack([*torch.meshgrid(ray_x, ray_y, indexing="xy"), torch.ones_like(hits.depth)])
-    points = turn.mT @ (ray * hits.depth).flatten(1) + camera[:, None]  # (3, P)
-
-    # Everything below happens in the axes of the solid that a pixel sees.
-    up = solids.local_from_world[..., 1] * -1
-    to_local = solids.local_from_world
-    table = torch.cat(
-        [
-            to_local.flatten(1),
-            -_apply(to_local, solids.centre),
-            _apply(to_local, light.position - solids.centre),
-            _apply(to_local, camera - solids.centre),
-            solids.half_size,
-            up,
-            surfaces.shade,
-        ],
-        dim=1,
-    )
-    index = hits.solid.flatten()
-    rotation, shift, lamp, eye, half_size, up, shade = (
-        table.T.contiguous().index_select(1, index).split_with_sizes([9, 3, 3, 3, 3, 3, 7])
-    )
-    local = (rotation.view(3, 3, -1) * points).sum(dim=1) + shift
-    axis, normal = _face(local / half_size, half_size, solids.shape[index], index == 0)
-    u = torch.where(axis == 0, local[2], local[0])
-    v = torch.where(axis == 1, local[2], local[1])
-
-    to_lamp, to_eye = lamp - local, eye - local
-    lamp_distance = to_lamp.norm(dim=0)
-    facing = ((to_lamp * normal).sum(dim=0) / lamp_distance).clamp_min(0)
-    falloff = facing / (0.35 + 0.12 * lamp_distance.square())
-    # The ceiling is lit by the floor: what looks down gets half of the ambient light.
-    sky = 0.75 + 0.25 * (up * normal).sum(dim=0)
-    wave = torch.sin(local * shade[:3] + shade[3:6]).sum(dim=0)
-    shadow = 1 - shade[6] * (0.5 + 0.5 * torch.tanh(3 * wave))
-    irradiance = light.ambient[:, None] * sky + light.lamp[:, None] * falloff
-
-    eye_distance = to_eye.norm(dim=0)
-    slant = ((to_eye * normal).sum(dim=0).abs() / eye_distance).clamp(0.05, 1)
-    # Metres of surface under a pixel; the geometric mean of its long and short side.
-    footprint = eye_distance / K[0, 0] / slant.sqrt()
-    face = 6 * index + 2 * axis + (local.gather(0, axis[None])[0] > 0)
-    radiance: Tensor = _albedo(room, atlas, face, u, v, footprint) * irradiance * shadow
-    return radiance
+def _add_reflections(
+    radiance: Tensor,
+    room: Room,
+    atlas: Atlas,
+    hits: Hits,
+    shaded: Shaded,
+    K: Tensor,
+    cam_from_world: Tensor,
+) -> None:
+    """Add to ``(3, H, W)`` what plane polished faces mirror, one bounce deep."""
+    face = shaded.face.view(hits.depth.shape)
+    share = shaded.mirrored.view(hits.depth.shape)
+    for mirror in _mirrors(room, shaded.face):
+        mask = face == mirror
+        rows, columns = mask.any(1).nonzero(), mask.any(0).nonzero()
+        window = (
+            slice(int(rows[0]), int(rows[-1]) + 1),
+            slice(int(columns[0]), int(columns[-1]) + 1),
+        )
+        shifted = K.clone()
+        shifted[0, 2] -= window[1].start
+        shifted[1, 2] -= window[0].start
+        camera = cam_from_world @ _mirror_image(room, mirror)
+        depth = hits.depth[window]
+        seen = cast_rays(
+            room.solids,
+            shifted,
+            camera,
+            image_size=(depth.shape[0], depth.shape[1]),
+            beyond=depth + 1e-3,
+        )
+        light = shade(room, atlas, seen, shifted, camera).radiance.view(3, *depth.shape)
+        sigma = min(float(room.surfaces.roughness[mirror // 6] * K[0, 0]) / 2, LONGEST_BLUR)
+        if sigma > 0.3:
+            light = _blur(light, sigma)
+        radiance[:, *window] += light * share[window] * mask[window]
 
 
-def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return (matrices @ vectors[..., None])[..., 0]
-
-
-def _face(unit: Tensor, half_size: Tensor, shape: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
-    """The axis ``(P,)`` whose face a point lies on, and the unit normal ``(3, P)`` there.
-
-    Round solids have the faces of the box around them: the texture is projected along
-    the axis on which the point is farthest out.
-
-    Args:
-        unit: ``(3, P)`` points on the surface of the unit cube, ball or cylinder.
-        half_size: ``(3, P)`` metres, of the solid each point belongs to.
-        shape: ``(P,)`` BOX, ELLIPSOID or CYLINDER.
-        inside: ``(P,)`` True where the solid is seen from inside.
-    """
-    x, y, z = unit.abs()
-    is_cylinder = shape == CYLINDER
-    # On the caps |y| = 1 > radius, on the side |y| < 1 = radius: no threshold needed.
-    rim = torch.where(is_cylinder, torch.hypot(x, z), torch.maximum(x, z))
-    axis = torch.where(y > rim, 1, torch.where(x >= z, 0, 2))
-    one_hot = axis == torch.arange(3)[:, None]
-    flat = torch.where(one_hot, unit.sign(), 0.0)
-    radial = unit / half_size  # the gradient of the quadric
-    upright = torch.stack([radial[0], torch.zeros_like(y), radial[2]])
-    curved = torch.where(is_cylinder, upright, radial)
-    is_flat = (shape == BOX) | (is_cylinder & (axis == 1))
-    normal = torch.where(is_flat, flat, F.normalize(curved, dim=0))
-    return axis, torch.where(inside, -normal, normal)
-
-
-def _albedo(
-    room: Room, atlas: Atlas, face: Tensor, u: Tensor, v: Tensor, footprint: Tensor
-) -> Tensor:
-    """Colour of the surface ``(3, P)`` under each pixel, filtered to its size."""
+def _mirrors(room: Room, face: Tensor) -> list[int]:
+    """The largest polished plane faces in view; ``face`` ``(P,)`` as in :class:`Shaded`."""
     surfaces = room.surfaces
-    table = torch.cat(
-        [
-            surfaces.scale.flatten(0, 1),
-            surfaces.offset.flatten(0, 1),
-            surfaces.tint.flatten(0, 1),
-            surfaces.contrast.flatten()[:, None],
-        ],
-        dim=1,
-    )
-    scale, offset, tint, contrast = (
-        table.T.contiguous().index_select(1, face).split_with_sizes([2, 2, 3, 1])
-    )
-    place = scale * torch.stack([u, v]) + offset
-    texels = footprint * scale.mean(dim=0) * TEXTURE_SIZE
-    level = texels.log2().clamp(0, len(LEVEL_SIZES) - 1)
-    first = surfaces.texture.flatten()[face] * TEXELS_PER_TEXTURE
-    finer = level.long()
-    coarser = (finer + 1).clamp_max(len(LEVEL_SIZES) - 1)
-    blend = level - finer
-    colour = _bilinear(atlas, first, finer, place, weight=1 - blend)
-    colour = colour + _bilinear(atlas, first, coarser, place, weight=blend)
-    return tint * (0.5 + contrast * (colour / 255 - 0.5)).clamp_min(0)
+    counts = face.bincount(minlength=surfaces.gloss.numel())
+    polished = (surfaces.gloss.flatten() > 0) & (room.solids.shape == BOX).repeat_interleave(6)
+    counts = torch.where(polished & (counts > SMALLEST_MIRROR * len(face)), counts, 0)
+    largest = counts.sort(descending=True, stable=True).indices[:MAX_MIRRORS]
+    return [int(n) for n in largest if counts[n] > 0]
 
 
-def _bilinear(
-    atlas: Atlas, first: Tensor, level: Tensor, place: Tensor, *, weight: Tensor
-) -> Tensor:
-    """Weighted texture values ``(3, P)`` in 0 ... 255 at ``place``, ``(2, P)`` repetitions.
-
-    Args:
-        atlas: where the texels are.
-        first: ``(P,)`` the first texel of each texture.
-        level: ``(P,)`` which of ``LEVEL_SIZES``.
-        place: ``(2, P)``.
-        weight: ``(P,)`` multiplies the values.
-    """
-    sizes = torch.tensor(LEVEL_SIZES)
-    starts = sizes.square().cumsum(0) - sizes.square()
-    size = sizes[level]
-    start = first + starts[level]
-    # Texel i covers i ... i + 1 of `size`: its centre is at i + 0.5.
-    continuous = place * size - 0.5
-    corner = continuous.floor()
-    (right, down) = continuous - corner
-    # The sizes are powers of two, so `&` wraps around, negative numbers too.
-    x0, y0 = corner.long() & (size - 1)
-    x1, y1 = (x0 + 1) & (size - 1), (y0 + 1) & (size - 1)
-    total = torch.zeros(len(level), 3)
-    for x, weight_x in ((x0, 1 - right), (x1, right)):
-        for y, weight_y in ((y0, 1 - down), (y1, down)):
-            texels = atlas.texels.index_select(0, start + y * size + x)
-            total.addcmul_(texels.float(), (weight * weight_x * weight_y)[:, None])
-    return total.T
+def _mirror_image(room: Room, face: int) -> Tensor:
+    """The reflection ``(4, 4)`` of the world at the plane of a face."""
+    solid, axis, sign = face // 6, face % 6 // 2, face % 2 * 2 - 1
+    normal = room.solids.local_from_world[solid, axis]
+    offset = normal @ room.solids.centre[solid] + sign * room.solids.half_size[solid, axis]
+    reflection = torch.eye(4)
+    reflection[:3, :3] -= 2 * torch.outer(normal, normal)
+    reflection[:3, 3] = 2 * offset * normal
+    return reflection
 
 
 def _blur(image: Tensor, sigma: float) -> Tensor:
-    """A lens: 3x3 Gaussian of ``sigma`` pixels over ``(3, H, W)``."""
-    side = torch.exp(torch.tensor(-0.5 / sigma**2))
-    kernel = torch.stack([side, torch.ones(()), side]) / (1 + 2 * side)
-    padded = F.pad(image[:, None], (1, 1, 1, 1), mode="replicate")
-    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 3, 1)), kernel.view(1, 1, 1, 3))[:, 0]
+    """Gaussian of ``sigma`` pixels over ``(3, H, W)``."""
+    # A reflection may be cut from a window smaller than the kernel.
+    radius = min(max(1, math.ceil(2 * sigma)), min(image.shape[-2:]))
+    size = (2 * radius + 1, 2 * radius + 1)
+    blurred: Tensor = gaussian_blur2d(image[None], size, (sigma, sigma), "replicate")[0]
+    return blurred

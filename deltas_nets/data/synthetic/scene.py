@@ -78,6 +78,8 @@ AT_WALL: tuple[Callable[[np.random.Generator], list[Solid]], ...] = (
     furniture.sofa,
     furniture.table,
     furniture.door,
+    furniture.kitchen,
+    furniture.kitchen,
 )
 
 
@@ -150,10 +152,12 @@ def _furnish(
         turn = rotation(yaw=rng.uniform(-np.pi, np.pi))
         origin = (centre + share * (spot - centre)) * (1, 0, 1)
         place(FREE_STANDING[rng.integers(len(FREE_STANDING))](rng), origin, turn)
-    for make in [AT_WALL[rng.integers(len(AT_WALL))] for _ in range(rng.integers(1, 4))] + [
-        furniture.poster for _ in range(rng.integers(1, 5))
-    ]:
-        spot, _, wall_yaw = _look(centre, heading + rng.uniform(-0.7, 0.7), half_size)
+    ahead = [AT_WALL[rng.integers(len(AT_WALL))] for _ in range(rng.integers(1, 4))]
+    ahead += [furniture.poster] * int(rng.integers(1, 5))
+    # What is behind the cameras is seen in mirrors only.
+    behind = [furniture.poster] * int(rng.integers(1, 5))
+    for make, reach in [(make, 0.7) for make in ahead] + [(make, np.pi) for make in behind]:
+        spot, _, wall_yaw = _look(centre, heading + rng.uniform(-reach, reach), half_size)
         group = make(rng)
         back = max(float(solid.centre[2] + solid.half_size[2]) for solid in group)
         turn = rotation(yaw=wall_yaw)
