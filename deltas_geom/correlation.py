@@ -59,17 +59,21 @@ def correlate(
         feature_map=(feature_map, "S D h w"),
         samples=(samples.pixels, "S N O M 2"),
     )
+    pixels, mask = samples.pixels, samples.mask
     batch = batch_shape(
-        (*descriptors.shape[:-2], 1), feature_map.shape[:-3], samples.pixels.shape[:-4]
+        (*descriptors.shape[:-2], 1),
+        feature_map.shape[:-3],
+        pixels.shape[:-4],
+        mask.shape[:-3],
     )
-    dots = _in_pieces(
+    return _in_pieces(
         lambda *piece: _DotProducts.apply(*piece, image_size),  # type: ignore[no-untyped-call]
         feature_map.expand(*batch, *feature_map.shape[-3:]),
         descriptors.unsqueeze(-3).expand(*batch, *descriptors.shape[-2:]),
-        samples.pixels.expand(*batch, *samples.pixels.shape[-4:]),
+        pixels.expand(*batch, *pixels.shape[-4:]),
+        mask.expand(*batch, *pixels.shape[-4:-1]),
         elements=feature_map.shape[-2:].numel(),
     )
-    return torch.where(samples.mask, dots, 0.0)
 
 
 def correlate_normalized(
@@ -132,19 +136,23 @@ def _in_pieces(
     if torch.compiler.is_compiling():  # pieces would fix the number of keypoints
         return function(maps, *keypoints)
     batch, cached = maps.shape[:-3], maps.device.type == "cpu"
+    limit = _CACHED_ELEMENTS if cached else _HELD_ELEMENTS
+    dim, held = len(batch), max(1, batch.numel() * elements)
+    if keypoints[0].shape[dim] * held <= limit:
+        return function(maps, *keypoints)
     if cached and len(batch) > 0 and batch[0] > 0:
         # unbind and split, not indices: their backward writes every gradient once.
         views = zip(maps.unbind(), *(tensor.unbind() for tensor in keypoints), strict=True)
         return torch.stack([_in_pieces(function, *view, elements=elements) for view in views])
-    limit = _CACHED_ELEMENTS if cached else _HELD_ELEMENTS
-    chunk = max(16, limit // max(1, batch.numel() * elements))
-    dim = len(batch)
+    chunk = max(16, limit // held)
     chunks = zip(*(torch.split(tensor, chunk, dim=dim) for tensor in keypoints), strict=True)
     return torch.cat([function(maps, *some) for some in chunks], dim=dim)
 
 
 class _DotProducts(torch.autograd.Function):
     """Of features ``(*B, D, h, w)``, descriptors ``(*B, n, D)`` at pixels ``(*B, n, O, S, 2)``.
+
+    0 where ``mask``, ``(*B, n, O, S)``, is False.
 
     Written out and not left to :func:`recomputed`, because the gradients of both factors need
     no correlation map: a third of the products of the backward pass.
@@ -154,13 +162,17 @@ class _DotProducts(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        features: Tensor, descriptors: Tensor, pixels: Tensor, image_size: tuple[int, int]
+        features: Tensor,
+        descriptors: Tensor,
+        pixels: Tensor,
+        mask: Tensor,
+        image_size: tuple[int, int],
     ) -> Tensor:
         with torch.autocast(features.device.type, enabled=False):
             flat, rows, grid = _in_full(features, descriptors, pixels, image_size)
             maps = (rows @ flat).reshape(-1, 1, *features.shape[-2:])
             read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
-        return read.reshape(pixels.shape[:-1])
+        return _masked(read.reshape(mask.shape), mask)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -169,7 +181,7 @@ class _DotProducts(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        features, descriptors, pixels = ctx.saved_tensors
+        features, descriptors, pixels, mask = ctx.saved_tensors
         moves = ctx.needs_input_grad[2]
         with torch.autocast(features.device.type, enabled=False):
             flat, rows, grid = _in_full(features, descriptors, pixels, ctx.image_size)
@@ -177,7 +189,9 @@ class _DotProducts(torch.autograd.Function):
             # Only the gradient of the places reads the values of the maps.
             maps = rows @ flat if moves else rows.new_zeros(()).expand(count, 1, *size)
             of_maps, of_grid = torch.ops.aten.grid_sampler_2d_backward(
-                gradient.reshape(count, 1, *pixels.shape[-3:-1]).contiguous(),
+                torch.where(mask, gradient, 0.0)
+                .reshape(count, 1, *pixels.shape[-3:-1])
+                .contiguous(),
                 maps.reshape(count, 1, *size),
                 grid,
                 interpolation_mode=0,  # bilinear
@@ -189,9 +203,9 @@ class _DotProducts(torch.autograd.Function):
             of_features = (rows.mT @ of_maps).reshape(features.shape).to(features.dtype)
             of_descriptors = (of_maps @ flat.mT).to(descriptors.dtype)
         if not moves:
-            return of_features, of_descriptors, None, None
+            return of_features, of_descriptors, None, None, None
         of_pixels = of_grid.reshape(pixels.shape) * _of_grid(ctx.image_size, like=of_grid)[1]
-        return of_features, of_descriptors, of_pixels.to(pixels.dtype), None
+        return of_features, of_descriptors, of_pixels.to(pixels.dtype), None, None
 
 
 def _in_full(
@@ -201,20 +215,31 @@ def _in_full(
     dtype = torch.promote_types(features.dtype, descriptors.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
     pixels = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
-    shift, slope = (part.repeat(pixels.shape[-2]) for part in _of_grid(image_size, like=pixels))
+    shift, slope = _of_grid(image_size, like=pixels).repeat(1, pixels.shape[-2]).unbind()
     # One pass along rows of x, y, x, y: four, two numbers wide, take as long as the sampling.
     grid = torch.addcmul(shift, pixels.flatten(-2), slope).to(dtype)
     # The backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU). At
     # the border it has a value and no gradient.
-    grid = grid.nan_to_num(nan=-1.0).reshape(pixels.shape).flatten(0, -4)
+    grid = grid.nan_to_num_(nan=-1.0).reshape(pixels.shape).flatten(0, -4)
     return features.to(dtype).flatten(-2), descriptors.to(dtype), grid
 
 
-def _of_grid(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
+def _of_grid(image_size: tuple[int, int], *, like: Tensor) -> Tensor:
     """Value at pixel (0, 0) and slope of :func:`normalize_pixels`, which is affine."""
     pixels = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
-    at_zero, at_one = normalize_pixels(pixels, image_size=image_size).unbind()
-    return at_zero.to(like), (at_one - at_zero).to(like)
+    ends = normalize_pixels(pixels, image_size=image_size)
+    ends[1] -= ends[0]
+    return ends.to(like)
+
+
+def _masked(values: Tensor, mask: Tensor) -> Tensor:
+    """Values in float32 or float64 where the mask is True, elsewhere 0; no derivatives."""
+    if torch.compiler.is_compiling():
+        return torch.where(mask, values, 0.0)
+    # Eager, torch.where branches at each number: half the time of the sampling itself. Here all
+    # bits of a number are kept, or none.
+    bits = torch.int32 if values.dtype == torch.float32 else torch.int64
+    return (values.view(bits) & mask.to(bits).neg_()).view(values.dtype)
 
 
 def _length_table(feature_map: Tensor) -> tuple[Tensor]:

@@ -4,7 +4,7 @@ A batch of matrices is a struct of arrays: ten tensors of any common shape, the 
 row by row. Elementwise arithmetic over the batch is an order of magnitude faster than a
 batched library call, never raises and compiles.
 
-Source: Golub and Van Loan, 4th ed., section 4.1.
+Source: Golub and Van Loan, 4th ed., sections 4.1 and 5.2.8.
 """
 
 from typing import NamedTuple
@@ -14,12 +14,17 @@ from torch import Tensor
 
 Symmetric4 = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """m00 m01 m02 m03 m11 m12 m13 m22 m23 m33."""
+Vector3 = tuple[Tensor, Tensor, Tensor]
 Vector4 = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def rounding(matrix: Symmetric4) -> Tensor:
     """What rounding of the entries may do to an eigenvalue; without gradient."""
-    trace = (matrix[0] + matrix[4] + matrix[7] + matrix[9]).detach()
+    return rounding_of((matrix[0] + matrix[4] + matrix[7] + matrix[9]).detach())
+
+
+def rounding_of(trace: Tensor) -> Tensor:
+    """The same from the trace."""
     return (64 * torch.finfo(trace.dtype).eps) * trace
 
 
@@ -42,6 +47,11 @@ def dot(a: Vector4, b: Vector4) -> Tensor:
     return total
 
 
+def dot3(a: Vector3, b: Vector3) -> Tensor:
+    """a · b of three components."""
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
+
+
 def unit(x: Vector4) -> Vector4:
     """x / |x|."""
     return scaled(x, dot(x, x).rsqrt())
@@ -61,6 +71,34 @@ def shifted(matrix: Symmetric4, shift: Tensor) -> Symmetric4:
     """M - shift."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
     return m00 - shift, m01, m02, m03, m11 - shift, m12, m13, m22 - shift, m23, m33 - shift
+
+
+class Pivots(NamedTuple):
+    """LDL^T, unit lower triangular L.
+
+    Attributes:
+        i0: inverse pivot 0, and so on.
+        i1: ...
+        i2: ...
+        d3: the last pivot, which may vanish.
+        l10: row 1, column 0 of L, and so on.
+        l20: ...
+        l30: ...
+        l21: ...
+        l31: ...
+        l32: ...
+    """
+
+    i0: Tensor
+    i1: Tensor
+    i2: Tensor
+    d3: Tensor
+    l10: Tensor
+    l20: Tensor
+    l30: Tensor
+    l21: Tensor
+    l31: Tensor
+    l32: Tensor
 
 
 class Factors(NamedTuple):
@@ -97,7 +135,7 @@ class Factors(NamedTuple):
     l32: Tensor
 
 
-def factor(matrix: Symmetric4) -> Factors:
+def eliminate(matrix: Symmetric4) -> Pivots:
     """LDL^T of matrices, the last coordinate eliminated last."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
     i0 = m00.reciprocal()
@@ -109,7 +147,76 @@ def factor(matrix: Symmetric4) -> Factors:
     t32 = less(less(m23, l30, m02), l31, t21)
     l32 = t32 * i2
     d3 = less(less(less(m33, l30, m03), l31, t31), l32, t32)
+    return Pivots(i0, i1, i2, d3, l10, l20, l30, l21, l31, l32)
+
+
+def factor(matrix: Symmetric4) -> Factors:
+    """The same, to solve with."""
+    i0, i1, i2, d3, *lower = eliminate(matrix)
+    return Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, *lower)
+
+
+def factor_columns(columns: Vector4) -> Factors:
+    """LDL^T of A^T A from A itself, by modified Gram-Schmidt: as exact as a QR of A.
+
+    :func:`factor` of the product knows eigenvalues only down to rounding of the largest; this
+    knows their roots so.
+
+    Args:
+        columns: four ``(*B, R, N)`` of N matrices A, each of R rows.
+    """
+    a0, a1, a2, a3 = columns
+    i0 = _over_rows(a0, a0).reciprocal()
+    l10, l20, l30 = (_over_rows(a0, a) * i0 for a in (a1, a2, a3))
+    a1, a2, a3 = _less_column(a1, l10, a0), _less_column(a2, l20, a0), _less_column(a3, l30, a0)
+    i1 = _over_rows(a1, a1).reciprocal()
+    l21, l31 = _over_rows(a1, a2) * i1, _over_rows(a1, a3) * i1
+    a2, a3 = _less_column(a2, l21, a1), _less_column(a3, l31, a1)
+    i2 = _over_rows(a2, a2).reciprocal()
+    l32 = _over_rows(a2, a3) * i2
+    a3 = _less_column(a3, l32, a2)
+    d3 = _over_rows(a3, a3)
     return Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, l10, l20, l30, l21, l31, l32)
+
+
+def _over_rows(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(dim=-2)
+
+
+def _less_column(a: Tensor, share: Tensor, b: Tensor) -> Tensor:
+    return less(a, share.unsqueeze(-2), b)
+
+
+def shifted_factors(f: Factors, shift: Tensor) -> Factors:
+    """LDL^T of M - shift from that of M, whose digits it keeps.
+
+    Column by column the difference C of the remainders, at first -shift, is carried along.
+    """
+    i0 = f.i0 / (1 - shift * f.i0)
+    w1, w2, w3 = f.l10 * shift, f.l20 * shift, f.l30 * shift
+    l10, l20, l30 = (torch.addcmul(a, b, i0) for a, b in ((f.l10, w1), (f.l20, w2), (f.l30, w3)))
+    c11, c12, c13 = less(-shift, w1, l10), -w1 * l20, -w1 * l30
+    c22, c23, c33 = less(-shift, w2, l20), -w2 * l30, less(-shift, w3, l30)
+    i1 = f.i1 / (1 + c11 * f.i1)
+    w2, w3 = less(c12, f.l21, c11), less(c13, f.l31, c11)
+    l21, l31 = torch.addcmul(f.l21, w2, i1), torch.addcmul(f.l31, w3, i1)
+    c22 = less(less(c22, f.l21, c12), w2, l21)
+    c23 = less(less(c23, f.l21, c13), w2, l31)
+    c33 = less(less(c33, f.l31, c13), w3, l31)
+    i2 = f.i2 / (1 + c22 * f.i2)
+    w3 = less(c23, f.l32, c22)
+    l32 = torch.addcmul(f.l32, w3, i2)
+    d3 = f.d3 + less(less(c33, f.l32, c23), w3, l32)
+    return Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, l10, l20, l30, l21, l31, l32)
+
+
+def solve_leading(f: Pivots, b: Vector3) -> Vector3:
+    """A^-1 b, A the leading 3x3 block."""
+    b0, b1, b2 = b
+    b1 = less(b1, f.l10, b0)
+    x2 = less(less(b2, f.l20, b0), f.l21, b1) * f.i2
+    x1 = less(b1 * f.i1, f.l21, x2)
+    return less(less(b0 * f.i0, f.l10, x1), f.l20, x2), x1, x2
 
 
 def solve_scaled(f: Factors, b: Vector4) -> Vector4:

@@ -25,6 +25,14 @@ def normal_matrix(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[
     Returns:
         K (K + 1) / 2 entries ``(*B, N)``.
     """
+    across, down = x * squared, y * squared
+    square = torch.addcmul(x * across, y, down)
+    terms = torch.stack([square, across, down, squared.expand_as(across)], dim=-2)
+    return over_views(_coefficients(proj).flatten(-3, -2).mT, terms.flatten(-3, -2))
+
+
+def _coefficients(proj: Tensor) -> Tensor:
+    """``(*B, V, 4, K (K + 1) / 2)`` of x^2 + y^2, x, y and 1."""
     p1, p2, p3 = proj.unbind(dim=-2)
     first, second = _outer(p3, p1), _outer(p3, p2)
     squares = torch.stack(
@@ -36,12 +44,27 @@ def normal_matrix(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[
         ],
         dim=-3,
     )  # (*B, V, 4, K, K)
-    upper = [squares[..., row, row:] for row in range(proj.shape[-1])]
-    coefficients = torch.cat(upper, dim=-1)
-    across, down = x * squared, y * squared
-    square = torch.addcmul(x * across, y, down)
-    terms = torch.stack([square, across, down, squared.expand_as(across)], dim=-2)
-    return over_views(coefficients.flatten(-3, -2).mT, terms.flatten(-3, -2))
+    return torch.cat([squares[..., row, row:] for row in range(proj.shape[-1])], dim=-1)
+
+
+def alike_coefficients(proj: Tensor, squared: Tensor) -> Tensor:
+    """What :func:`alike_normal_matrix` needs of cameras, once for all points.
+
+    Args:
+        proj: see :func:`normal_matrix`.
+        squared: ``(*B, V, 1)`` squared weights, those of all points.
+    """
+    square, x, y, one = (_coefficients(proj) * squared.unsqueeze(-1)).unbind(dim=-2)
+    pixels = torch.stack([x, y], dim=-2).flatten(-3, -2)
+    return torch.cat([pixels, square, one.sum(dim=-2, keepdim=True)], dim=-2).mT
+
+
+def alike_normal_matrix(coefficients: Tensor, xy: Tensor) -> tuple[Tensor, ...]:
+    """:func:`normal_matrix` of pixels ``(*B, V, 2, N)`` that all weigh the same."""
+    x, y = xy.unbind(dim=-2)
+    square = torch.addcmul(x * x, y, y)
+    one = torch.ones_like(square[..., :1, :])
+    return over_views(coefficients, torch.cat([xy.flatten(-3, -2), square, one], dim=-2))
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

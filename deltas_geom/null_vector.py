@@ -1,8 +1,8 @@
 """The null vector of symmetric 4x4 matrices (ldl.py), by arithmetic alone.
 
 The route is LDL with the last coordinate eliminated last (robust to the world's unit and
-origin), and inverse iterations. Where a bound on the error proves those to be enough, that is
-all; elsewhere a Rayleigh quotient iteration follows, and a count of the eigenvalues below it.
+origin), and inverse iterations. Where a bound on the error proves those to be enough (proof.py),
+that is all; elsewhere a Rayleigh quotient iteration follows, and a count of the eigenvalues below.
 Gradients come from one more Rayleigh step, solved in the complement of the vector, where they
 stay finite when other eigenvalues meet (there SVD's are NaN).
 
@@ -16,21 +16,25 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.chunks import surely_all, values_at_hand
 from deltas_geom.ldl import (
     Factors,
     Symmetric4,
     Vector4,
     dot,
     factor,
+    factor_columns,
     less,
     multiply,
     rounding,
     scaled,
     shifted,
+    shifted_factors,
     solve_scaled,
     start,
     unit,
 )
+from deltas_geom.proof import proved_vector
 
 # After the start. One is enough for good matches; gross outliers bring eigenvalues near.
 _INVERSE_ITERATIONS = 2
@@ -56,6 +60,7 @@ def null_vector(
     accuracy: float = 0.0,
     product: Callable[[Vector4], Vector4] | None = None,
     polish: int = 0,
+    columns: Vector4 | None = None,
 ) -> NullVector:
     """Vector x that minimises x^T M x / x^T x.
 
@@ -65,13 +70,19 @@ def null_vector(
         product: M x, computed more exactly than from M: for M = A^T A, A^T (A x).
         polish: corrections by ``product``, each of which takes the vector from the accuracy that
             M allows nearer to that of A.
+        columns: four ``(*B, R, N)`` of A, whose accuracy the vector then has, whatever M has lost
+            of it. They make polish needless, and cost about three corrections. Where the first
+            three have a null vector of their own the answer may not be finite.
     """
-    if polish > 0 or accuracy < 1e-9 or not _may_choose(matrix[0]):
+    if columns is not None:
+        vector, simple = _iterated(matrix)
+        return NullVector(_by_columns(columns, vector), simple)
+    if polish > 0 or accuracy < 1e-9 or not values_at_hand(matrix[0]):
         return _iterated(matrix, product=product, polish=polish)
-    vector, proved = _proved(matrix, accuracy)
-    hard = proved.logical_not().flatten().nonzero().squeeze(-1)
-    if hard.numel() == 0:
+    vector, proved = proved_vector(matrix, accuracy)
+    if surely_all(proved):
         return NullVector(vector, proved)
+    hard = proved.logical_not().flatten().nonzero().squeeze(-1)
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
         entry.flatten().index_select(0, hard) for entry in matrix
     )
@@ -82,15 +93,6 @@ def null_vector(
 
     x0, x1, x2, x3 = map(merged, vector, some.vector)
     return NullVector((x0, x1, x2, x3), merged(proved, some.simple))
-
-
-def _may_choose(tensor: Tensor) -> bool:
-    """May what is computed depend on values: nobody traces it, and no other device has them?"""
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
-        return False
-    if torch._C._are_functorch_transforms_active():
-        return False
-    return type(tensor) is Tensor and tensor.device.type == "cpu"
 
 
 def _inverse_iterations(matrix: Symmetric4, noise: Tensor) -> tuple[Factors, Vector4, Vector4]:
@@ -105,27 +107,6 @@ def _inverse_iterations(matrix: Symmetric4, noise: Tensor) -> tuple[Factors, Vec
         x = solve_scaled(factors, x)
     x = unit(x)  # before it overflows: towards infinity each solve makes it longer
     return factors, x, solve_scaled(factors, x)
-
-
-def _proved(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]:
-    """Vectors by inverse iterations, and which of them are proved to be within ``accuracy``.
-
-    Their error is at most the residual by the distance to the second eigenvalue, and that is not
-    below the smallest of the leading 3x3 block, nor that below 4 det / trace^2 of the block.
-    """
-    noise = rounding(matrix)
-    factors, x, y = _inverse_iterations(matrix, noise)
-    along, length = dot(x, y), dot(y, y)
-    inverse = length.reciprocal()
-    # (M + noise) y = d3 x: the residual is size times the sine of the angle between x and y.
-    size = factors.d3 * along * inverse
-    residual = less(length, along, along) * inverse * (size * size)  # squared
-    trace = matrix[0] + matrix[4] + matrix[7]
-    second = 4 / (factors.i0 * factors.i1 * factors.i2 * (trace * trace))
-    # Ten times the eigenvalue, which holds the noise, is more than rounding can feign.
-    apart = less(second, size, size.new_tensor(10.0))
-    allowed = (accuracy * (second - size)).square()
-    return y, (residual <= allowed) & (apart > 0)
 
 
 def _iterated(
@@ -171,6 +152,17 @@ def _nearer(
     # Off the quotient itself, where a pivot of a simple matrix may vanish exactly.
     below = -0.4 * noise
     factors = factor(shifted(matrix, quotient - below))
+    same = 256 * torch.finfo(noise.dtype).eps
+    return _smaller(factors, a, quotient, below=below, noise=noise, same=same)
+
+
+def _smaller(
+    factors: Factors, a: Vector4, quotient: Tensor, *, below: Tensor, noise: Tensor, same: float
+) -> tuple[Vector4, Tensor]:
+    """The same by factors of M - (quotient - below).
+
+    Vectors the squared sine of whose angle is below ``same`` count as one.
+    """
     b = solve_scaled(factors, a)  # K b = d3 a with K = M - shift, and a^T K a = below
     along, length = dot(a, b), dot(b, b)
     across = torch.addcmul(length, along, along, value=-1)
@@ -179,7 +171,7 @@ def _nearer(
     half = 0.5 * torch.addcmul(below * across, along, g)
     step = half + torch.addcmul(half * half, g * g, across).clamp(min=0).sqrt()
     # Where both are one, or both quotients, within rounding, the iteration has converged.
-    flat = (across <= 256 * torch.finfo(length.dtype).eps * length) | (g.abs() <= noise)
+    flat = (across <= same * length) | (g.abs() <= noise)
     zero, one = noise.new_zeros(()), noise.new_ones(())
     of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
     of_b = torch.where(flat, one, -step)
@@ -199,6 +191,24 @@ def _polished(f: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> 
     along = dot(x, change)
     x0, x1, x2, x3 = (less(x[i], inverse, less(change[i], along, x[i])) for i in range(4))
     return x0, x1, x2, x3
+
+
+def _by_columns(columns: Vector4, x: Vector4) -> Vector4:
+    """The null vector of A from what M makes of it."""
+    factors = factor_columns(columns)
+    # No shift at first: x may be any mixture of vectors that M cannot tell apart, and its
+    # quotient is then near none of their eigenvalues.
+    x = unit(x)
+    near = solve_scaled(factors, x)
+    length = dot(near, near)
+    quotient = factors.d3 * dot(near, x) / length
+    nearest = shifted_factors(factors, quotient)
+    zero = torch.zeros_like(quotient)
+    # Vectors closer than 1e-4 span their plane badly, and need it no more.
+    near, quotient = _smaller(
+        nearest, scaled(near, length.rsqrt()), quotient, below=zero, noise=zero, same=1e-8
+    )
+    return solve_scaled(shifted_factors(factors, quotient), unit(near))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.chunks import values_at_hand
 
 # A view whose weight is below this share of the point's largest counts as no view: its squared
 # weight, times a small parallax, would be lost in the rounding of the normal matrix.
@@ -68,7 +69,7 @@ def _sum_of(row: Tensor, values: Tensor) -> Tensor:
 class Weights(NamedTuple):
     """How much each view counts for each point.
 
-    All but ``sound`` are those of one point, N = 1, where all points are alike.
+    They are those of one point, N = 1, where all points are alike.
 
     Attributes:
         squared: ``(*B, V, N)`` squared weights, a point's largest 1; 0 where unused. 0 or
@@ -125,6 +126,37 @@ def weigh(
     )
 
 
+def alike_weights(proj: Tensor) -> Weights:
+    """Those of one point for all that are seen by cameras ``(*B, V, 3, 4)`` and weigh the same."""
+    like = proj[..., :1, 0]
+    return weigh(None, None, batch=proj.shape[:-3], like=like[..., None], sound=like == like)
+
+
+class Cameras(NamedTuple):
+    """Cameras in the solver's type.
+
+    Attributes:
+        proj: ``(*B, V, 3, 4)``, 0 for cameras that are not finite.
+        sick: ``(*B, V)`` 1 for those, else 0.
+        centers: ``(*B, V, 3)``, see :func:`projection_centers`.
+    """
+
+    proj: Tensor
+    sick: Tensor
+    centers: Tensor
+
+
+def cameras_of(proj: Tensor) -> Cameras:
+    """Tell finite cameras ``(*B, V, 3, 4)`` from others."""
+    check_shapes(proj=(proj, "V 3 4"))
+    work = solver_dtype(proj)
+    limit = torch.finfo(work).max ** 0.25
+    finite = (proj.detach().to(work).abs() < limit).all(-1).all(-1)
+    # Double where: what is not used must pass no gradient and no NaN.
+    clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
+    return Cameras(clean, (~finite).to(work), projection_centers(clean))
+
+
 class Observations(NamedTuple):
     """Pixels of N points in V views.
 
@@ -155,23 +187,45 @@ def observe(
     Raises:
         ShapeError: a trailing shape differs.
     """
-    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
-    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    cameras = cameras_of(proj)
+    xy, weighed = weigh_pixels(cameras, pixels, weights, mask)
+    return Observations(cameras.proj, cameras.sick, xy, weighed)
+
+
+def weigh_pixels(
+    cameras: Cameras, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> tuple[Tensor, Weights]:
+    """The pixels and weights of :func:`observe`."""
+    batch = check_pixels(cameras, pixels, weights, mask)
+    xy, sound = clean_pixels(pixels)
+    return xy, weigh(weights, mask, batch=batch, like=pixels, sound=sound)
+
+
+def check_pixels(
+    cameras: Cameras, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
+) -> torch.Size:
+    """:func:`check_weights` of pixels ``(*B, V, N, 2)``."""
+    check_shapes(proj=(cameras.proj, "V 3 4"), pixels=(pixels, "V N 2"))
+    return check_weights(weights, mask, "pixels", pixels, "V N 2", cameras.proj.shape[:-3])
+
+
+def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels ``(*B, V, 2, N)`` of the solver's type, 0 where not finite, and which are finite.
+
+    These are bool, ``(*B, V, N)``, or of one point for all.
+    """
     # Struct of arrays: sums over views then run over memory in order.
-    work = solver_dtype(proj)
+    work = solver_dtype(pixels)
     xy = pixels.mT.to(work, memory_format=torch.contiguous_format).contiguous()
-    x, y = xy.detach().unbind(dim=-2)
     limit = torch.finfo(work).max ** 0.25  # what is beyond overflows; NaN is not below
+    if values_at_hand(pixels):
+        every = xy.detach().flatten()
+        if bool(every.dot(every) < limit):
+            return xy, torch.ones_like(pixels[..., :1, 0], dtype=torch.bool)
+    x, y = xy.detach().unbind(dim=-2)
     sound = torch.addcmul(x * x, y, y) < limit
-    weighed = weigh(weights, mask, batch=batch, like=pixels, sound=sound)
-    finite = (proj.detach().to(work).abs() < limit).all(-1).all(-1)
-    # Double where throughout: what is not used must pass no gradient and no NaN.
-    return Observations(
-        proj=torch.where(finite[..., None, None], proj, 0.0).to(work),
-        sick=(~finite).to(work),
-        xy=torch.where(sound.unsqueeze(-2), xy, xy.new_zeros(())),
-        weights=weighed,
-    )
+    # Double where: what is not used must pass no gradient and no NaN.
+    return torch.where(sound.unsqueeze(-2), xy, xy.new_zeros(())), sound
 
 
 def check_weights(

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.chunks import surely_all
 from deltas_geom.ldl import Symmetric4, Vector4, unit
 from deltas_geom.null_vector import null_vector, rayleigh_step
 from deltas_geom.observations import Vector3, Weights, over_views
@@ -163,6 +164,7 @@ def find_points(
     eps: float,
     product: Callable[[Vector4], Vector4] | None = None,
     polish: int = 0,
+    columns: Vector4 | None = None,
 ) -> FoundPoints:
     """The points that minimise the algebraic error.
 
@@ -172,9 +174,10 @@ def find_points(
         eps: rounding of the inputs, relative.
         product: see :func:`deltas_geom.null_vector.null_vector`.
         polish: see there.
+        columns: see there.
     """
     (x0, x1, x2, x3), simple = null_vector(
-        normal, accuracy=_NEGLIGIBLE * eps, product=product, polish=polish
+        normal, accuracy=_NEGLIGIBLE * eps, product=product, polish=polish, columns=columns
     )
     points = _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
     (x, y, z), (mx, my, mz) = points, frame.middle
@@ -238,8 +241,15 @@ def kept(points: Vector3, around: Tensor, valid: Tensor) -> Vector3:
         around: ``(*B, 1, 3)`` the origin of the sums.
         valid: ``(*B, N)`` bool.
     """
-    zero = around.new_zeros(())
-    x, y, z = (torch.where(valid, component, zero) for component in in_world(points, around))
+    return kept_in_world(in_world(points, around), valid)
+
+
+def kept_in_world(points: Vector3, valid: Tensor) -> Vector3:
+    """The valid ones of points three ``(*B, N)``, the others 0."""
+    if surely_all(valid):
+        return points
+    zero = points[0].new_zeros(())
+    x, y, z = (torch.where(valid, component, zero) for component in points)
     return x, y, z
 
 
@@ -255,12 +265,15 @@ def judge_points(
         representable: in the caller's type.
     """
     status = torch.zeros_like(in_front, dtype=torch.int8)
-    for passed, reason in (
+    reasons = (
         (in_front, Status.BEHIND_CAMERA),
         (found.near & representable, Status.AT_INFINITY),
         (found.posed, Status.NO_PARALLAX),
         (frame.enough, Status.TOO_FEW_VIEWS),
         (frame.finite, Status.NOT_FINITE_INPUT),
-    ):
+    )
+    if all(surely_all(passed) for passed, _ in reasons):
+        return status
+    for passed, reason in reasons:
         status = torch.where(passed, status, status.new_full((), reason.value))
     return status

@@ -9,26 +9,18 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.chunks import in_chunks
-from deltas_geom.ldl import Symmetric4, Vector4
-from deltas_geom.normal_matrix import normal_matrix
-from deltas_geom.observations import (
-    Observations,
-    Vector3,
-    observe,
-    over_views,
-    projection_centers,
-)
+from deltas_geom.chunks import in_chunks, surely_all
+from deltas_geom.equations import Alike, Posed, columns_of, pose, prepared, product_of
+from deltas_geom.ldl import Vector4
+from deltas_geom.observations import Cameras, Observations, Vector3
 from deltas_geom.rig_frame import (
     FoundPoints,
-    RigFrame,
     derivable_points,
     find_points,
-    in_frame,
     in_world,
     judge_points,
     kept,
-    rig_frames,
+    kept_in_world,
 )
 from deltas_geom.status import Status
 from deltas_geom.uncertainty import (
@@ -39,9 +31,6 @@ from deltas_geom.uncertainty import (
     residual_of,
     unpacked3,
 )
-
-# Steps in float64. In the world's frame extreme weights leave the normal matrix few digits.
-_POLISH = {"rig": 2, "world": 16}
 
 
 class Triangulation(NamedTuple):
@@ -78,14 +67,19 @@ def triangulate_points(
     """Points ``(*B, N, 3)`` alone; see :func:`triangulate`."""
     _check_frame(frame)
 
-    def values(*inputs: Tensor) -> tuple[Tensor]:
-        return (_outward(_values(*inputs, frame=frame), proj.dtype),)
+    def prepare(proj: Tensor) -> Cameras | Alike:
+        return prepared(proj, weights, mask, kind=frame)
 
-    def derivable(*inputs: Tensor) -> tuple[Tensor]:
-        return (_outward(_derivable(*inputs, frame=frame), proj.dtype),)
+    def values(known: Cameras | Alike, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor]:
+        posed = pose(known, pixels, *used, kind=frame, dtype=proj.dtype)
+        return (_outward(_values(posed, frame), proj.dtype),)
+
+    def derivable(proj: Tensor, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor]:
+        posed = pose(prepare(proj), pixels, *used, kind=frame, dtype=proj.dtype)
+        return (_outward(_derivable(posed, frame), proj.dtype),)
 
     points = ((pixels, -2), (weights, -1), (mask, -1))
-    return in_chunks(derivable, values, proj, points, dims=(-2,))[0]
+    return in_chunks(derivable, values, proj, points, dims=(-2,), prepare=prepare)[0]
 
 
 def triangulate(
@@ -130,7 +124,7 @@ def triangulate(
 
     _check_frame(frame)
 
-    def known(solved: _Solved) -> tuple[Tensor, ...]:
+    def described(solved: _Solved) -> tuple[Tensor, ...]:
         observed, valid = solved.observed, solved.status == Status.OK.value
         used = ~observed.weights.unused & valid.unsqueeze(-2)
         seen = reproject(observed.proj, solved.points, used)
@@ -149,42 +143,24 @@ def triangulate(
         outward = (tensor.to(proj.dtype).clamp(-limit, limit) for tensor in found)
         return (*outward, solved.status)
 
-    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
-        return known(_values(*inputs, frame=frame))
+    def prepare(proj: Tensor) -> Cameras | Alike:
+        return prepared(proj, weights, mask, kind=frame)
 
-    def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
-        return known(_derivable(*inputs, frame=frame))
+    def values(known: Cameras | Alike, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
+        return described(_values(pose(known, pixels, *used, kind=frame, dtype=proj.dtype), frame))
+
+    def derivable(proj: Tensor, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
+        posed = pose(prepare(proj), pixels, *used, kind=frame, dtype=proj.dtype)
+        return described(_derivable(posed, frame))
 
     dims = (-2, -1, -1, -1, *([-3] if covariance else []), -1)
     points = ((pixels, -2), (weights, -1), (mask, -1))
-    found = in_chunks(derivable, values, proj, points, dims=dims)
+    found = in_chunks(derivable, values, proj, points, dims=dims, prepare=prepare)
     places, depth, residual, parallax, *noise, status = found
     valid = status == Status.OK.value
     return Triangulation(
         places, depth, status, valid, residual, parallax, noise[0] if noise else None
     )
-
-
-class _Posed(NamedTuple):
-    """The points' equations, in frames where they are easy.
-
-    Attributes:
-        observed: what was seen.
-        around: ``(*B, 1, 3)`` the origin of the sums, in the world.
-        proj: ``(*B, V, 3, 4)`` of points relative to it.
-        centers: ``(*B, V, 3)`` of the cameras, in the world.
-        frame: of the points.
-        normal: ten ``(*B, N)``, in the frame.
-        dtype: of the inputs.
-    """
-
-    observed: Observations
-    around: Tensor
-    proj: Tensor
-    centers: Tensor
-    frame: RigFrame
-    normal: Symmetric4
-    dtype: torch.dtype
 
 
 class _Solved(NamedTuple):
@@ -203,101 +179,49 @@ class _Solved(NamedTuple):
     status: Tensor
 
 
-def _pose(
-    proj: Tensor,
-    pixels: Tensor,
-    weights: Tensor | None,
-    mask: Tensor | None,
-    *,
-    frame: str,
-) -> _Posed:
-    observed = observe(proj, pixels, weights, mask)
-    centers = projection_centers(observed.proj)
-    eps = torch.finfo(proj.dtype).eps
-    around, rig = rig_frames(centers, observed.weights, observed.sick, eps=eps)
-    moved = observed.proj[..., 3:] + observed.proj[..., :3] @ around.unsqueeze(-3).mT
-    near = torch.cat([observed.proj[..., :3].expand(*moved.shape[:-1], 3), moved], dim=-1)
-    if frame == "world":
-        ox, oy, oz = (-middle.expand_as(rig.unit) for middle in around.unbind(dim=-1))
-        rig = rig._replace(origin=(ox, oy, oz), unit=torch.ones_like(rig.unit))
-    x, y = observed.xy.unbind(dim=-2)
-    squared = observed.weights.squared
-    if rig.unit.shape[-1] == 1:  # one frame for all: few cameras are moved, not every matrix
-        normal = _ten(normal_matrix(_cameras_in_frame(near, rig), x, y, squared))
-    else:
-        normal = in_frame(_ten(normal_matrix(near, x, y, squared)), rig.origin, rig.unit)
-    return _Posed(observed, around, near, centers, rig, normal, proj.dtype)
-
-
-def _ten(entries: tuple[Tensor, ...]) -> Symmetric4:
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries
-    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
-
-
-def _cameras_in_frame(proj: Tensor, frame: RigFrame) -> Tensor:
-    """P T of cameras ``(*B, V, 3, 4)``, where :func:`in_frame` takes M to T^T M T."""
-    rows = proj[..., :3]
-    origin = torch.stack(frame.origin, dim=-2).unsqueeze(-3)  # (*B, 1, 3, 1)
-    last = (rows @ origin + proj[..., 3:]) / frame.unit[..., None, None]
-    return torch.cat([rows.expand(*last.shape[:-1], 3), last], dim=-1)
-
-
 @torch.no_grad()
-def _find(posed: _Posed, frame: str) -> tuple[FoundPoints, Tensor]:
-    """Points and their status, without gradient."""
+def _find(posed: Posed, frame: str) -> tuple[FoundPoints, Vector3, Tensor]:
+    """Points, the same in the world, and their status, without gradient."""
 
     def product(x: Vector4) -> Vector4:
-        return _product(posed, x)
+        return product_of(posed, x)
 
     # What the normal matrix loses of the rows' digits matters to those who have them.
-    polish = 0
-    if posed.dtype == torch.float64:
-        polish = _POLISH[frame]
+    polish, columns = 0, None
+    if posed.dtype == torch.float64 and frame == "world":
+        columns = columns_of(
+            posed.observed
+        )  # extreme weights leave the normal matrix few digits there
+    elif posed.dtype == torch.float64:
+        polish = 2
     eps = torch.finfo(posed.dtype).eps
-    found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = in_world(found.points, posed.around)
+    found = find_points(
+        posed.normal, posed.frame, eps=eps, product=product, polish=polish, columns=columns
+    )
+    places = in_world(found.points, posed.around)
     # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-    depth = in_views(posed.observed.proj[..., 2, :], (x, y, z))
-    in_front = torch.where(posed.observed.weights.unused, 1.0, depth).amin(dim=-2) > 0
+    depth = in_views(posed.observed.proj[..., 2, :], places)
+    unused = posed.observed.weights.unused
+    if not surely_all(~unused):
+        depth = torch.where(unused, 1.0, depth)
+    x, y, z = places
     held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
+    in_front = depth.amin(dim=-2) > 0
     status = judge_points(found, posed.frame, in_front=in_front, representable=held)
-    return found, status
+    return found, places, status
 
 
-def _values(*inputs: Tensor, frame: str) -> _Solved:
-    posed = _pose(*inputs, frame=frame)
-    found, status = _find(posed, frame)
-    points = kept(found.points, posed.around, status == Status.OK.value)
+def _values(posed: Posed, frame: str) -> _Solved:
+    _, places, status = _find(posed, frame)
+    points = kept_in_world(places, status == Status.OK.value)
     return _Solved(posed.observed, posed.centers, points, status)
 
 
-def _derivable(*inputs: Tensor, frame: str) -> _Solved:
-    posed = _pose(*inputs, frame=frame)
-    found, status = _find(posed, frame)
+def _derivable(posed: Posed, frame: str) -> _Solved:
+    found, _, status = _find(posed, frame)
     valid = status == Status.OK.value
     near = derivable_points(posed.normal, posed.frame, found.vector, valid)
     return _Solved(posed.observed, posed.centers, kept(near, posed.around, valid), status)
-
-
-def _product(posed: _Posed, v: Vector4) -> Vector4:
-    """A^T W^2 (A v) of the equations in the frame: the normal matrix times v, unsquared."""
-    (ox, oy, oz), inverse = posed.frame.origin, 1 / posed.frame.unit
-    w = v[3] * inverse
-    place = (torch.addcmul(v[0], ox, w), torch.addcmul(v[1], oy, w), torch.addcmul(v[2], oz, w))
-    p, squared = posed.proj, posed.observed.weights.squared
-    x, y = posed.observed.xy.unbind(dim=-2)
-    a, b, c = (_homogeneous_in_views(p[..., row, :], (*place, w)) for row in range(3))
-    across, down = (x * c - a) * squared, (y * c - b) * squared
-    sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
-    g0, g1, g2, g3 = over_views(p.flatten(-3, -2).mT, sums)
-    return g0, g1, g2, (ox * g0 + oy * g1 + oz * g2 + g3) * inverse
-
-
-def _homogeneous_in_views(row: Tensor, points: Vector4) -> Tensor:
-    total = row[..., 3, None] * points[3].unsqueeze(-2)
-    for axis in range(3):
-        total = torch.addcmul(total, row[..., axis, None], points[axis].unsqueeze(-2))
-    return total
 
 
 def _outward(solved: _Solved, dtype: torch.dtype) -> Tensor:

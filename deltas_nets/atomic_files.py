@@ -1,6 +1,7 @@
 """Depth, confidence, points and JSON as files that are whole whenever they exist.
 
-Every file is written under a temporary name beside it and renamed, which is atomic there.
+Every file is written under a temporary name beside it, brought to the disk and renamed, which is
+atomic there.
 """
 
 import contextlib
@@ -115,6 +116,9 @@ def write_json(path: Path, obj: object) -> None:
 def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Call ``write`` with a temporary file beside ``path``, then rename it to ``path``.
 
+    What is written is on the disk before the new name is, so that a power cut leaves the old file
+    or the new one.
+
     Raises:
         UserError: the system refuses; nothing is left behind then.
     """
@@ -124,6 +128,8 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         # Not tempfile, whose files are private to the user: outputs follow the umask.
         with temporary.open("xb") as file:
             write(file)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
         with contextlib.suppress(OSError):
@@ -131,6 +137,17 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         if isinstance(error, OSError):
             raise cannot_write(path, error) from error
         raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the names in a folder on the disk, where the system can: some know no such thing."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

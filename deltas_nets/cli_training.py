@@ -17,7 +17,7 @@ NETWORKS: tuple[Network, ...] = ("deltas-small", "deltas-resnet50", "deltas-vgg9
 
 @dataclass(frozen=True)
 class Train:
-    """Train a network on procedural rooms.
+    """Train a network on procedural rooms, or on scenes in ScanNet's layout (--data scannet).
 
     Writes config.json, checkpoint.pt, weights.safetensors, log.jsonl and TensorBoard's curves into
     --out; a run that was stopped goes on with --resume, or from weights alone with --init and
@@ -25,17 +25,22 @@ class Train:
 
     Example: deltas train --out runs/first --steps 2000
 
+    The paper's: deltas train --config deltas-resnet50 --data scannet --root DIR --out runs/paper
+
     On several GPUs: torchrun --nproc-per-node 4 -m deltas_nets.cli train --out runs/first
     """
 
     out: Path
-    """Folder of the run."""
+    """Folder of the run; named after the network if not given."""
     preset: Annotated[Network, tyro.conf.arg(name="config")] = "deltas-small"
     """Network and training to start from; the other flags change it. deltas-resnet50 and
     deltas-vgg9 are the paper's, with its losses and schedule."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    teacher_weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Published weights of --teacher; a resumed run wants them again."""
     resume: Flag = False
-    """Go on from the checkpoint in --out, with the config recorded there."""
+    """Go on from the checkpoint in --out, with the config recorded there. Only what changes no
+    result may be given anew: --devices, --num-nodes, --data.cache, --data.workers, --root."""
     init: Path | None = None
     """Start from these weights."""
     start_step: int = 0
@@ -43,7 +48,7 @@ class Train:
     checkpoint_every: int = 200
     """Steps between checkpoints; Ctrl-C writes one too."""
     validate_every: int = 500
-    """Steps between evaluations on rooms that no training sees."""
+    """Steps between evaluations on rooms that no training sees, or on --data.validation."""
     encoder: str = "pretrained"
     """Weights for the encoder: "pretrained" is EfficientNet-Lite0 from the package of the train
     extra (the paper's backbones start from random weights), "none" starts from random weights,
@@ -54,17 +59,18 @@ class Train:
     def run(self) -> None:
         """Do it."""
         from deltas_nets.checked_inputs import encoder_file
-        from deltas_nets.train.checkpoint import load_config
         from deltas_nets.train.fit import fit
+        from deltas_nets.train.resume import resumed_config
         from deltas_nets.train.start import Start
 
-        if self.resume and self.config != TRAIN_CONFIGS[self.preset]:
-            raise UserError(
-                "a resumed run keeps its config", "--resume", "leave out the options that change it"
-            )
         if self.start_step and self.init is None:
             raise UserError("start from what?", "--start-step", "add --init FILE")
-        config = load_config(self.out) if self.resume else self.config
+        config = self.config
+        if self.resume:
+            config = resumed_config(self.out, self.config, TRAIN_CONFIGS[self.preset])
+            if self.preset not in ("deltas-small", config.network.name):
+                what = f"the run to go on with is of {config.network.name}"
+                raise UserError(what, f"--config {self.preset}", "leave it out")
         if self.start_step >= config.steps:
             raise UserError(
                 f"the schedule ends at {config.steps}", "--start-step", "start before that"
@@ -76,7 +82,7 @@ class Train:
         fresh = not self.resume and self.init is None
         wanted = fresh and (config.network.backbone == "lite" or self.encoder != "pretrained")
         encoder = encoder_file(self.encoder) if wanted else None
-        start = Start(encoder, self.init, self.start_step, self.resume)
+        start = Start(encoder, self.init, self.start_step, self.resume, self.teacher_weights)
         weights = fit(
             config,
             self.out,

@@ -6,7 +6,12 @@ is written beside the weights.
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, get_type_hints
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+
+import tyro
+
+from deltas_nets.data.scannet_config import ScanNetConfig
 
 Config = TypeVar("Config")
 
@@ -118,22 +123,33 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Procedural rooms to train on."""
+    """What to train on."""
 
+    source: Annotated[
+        Literal["rooms", "scannet"], tyro.conf.arg(name="data", prefix_name=False)
+    ] = "rooms"
+    """rooms are procedural, with exact depth; scannet is scene folders in ScanNet's layout below
+    --root."""
     num_rooms: int = 4000
-    """Rooms in an epoch."""
+    """rooms: how many in an epoch."""
     seed: int = 1000
-    """Seed of the first room; validation rooms have seeds below 1000."""
+    """rooms: seed of the first one; validation rooms have seeds below 1000."""
     num_views: int = 5
-    """Views rendered per room; any of them can be the anchor."""
+    """rooms: views rendered of each; any of them can be the anchor."""
     height: int = 192
-    """Height of the rendered images, pixels."""
+    """Height of the images that are rendered or read, pixels."""
     width: int = 256
-    """Width of the rendered images, pixels."""
+    """Width of the images that are rendered or read, pixels."""
     cache: str | None = None
-    """Folder that keeps rendered rooms, 1.7 MB each; without it they are rendered each time."""
+    """Folder that keeps rendered rooms, 1.7 MB each, or ScanNet's poses, 0.15 KB a frame; without
+    it they are rendered or read each time."""
     workers: int = 1
     """Processes that read or render ahead; 0 does it in the training process."""
+    scannet: Annotated[ScanNetConfig, tyro.conf.arg(name="")] = field(default_factory=ScanNetConfig)
+
+    def __post_init__(self) -> None:
+        if self.source == "rooms" and self.scannet != ScanNetConfig():
+            raise ValueError("--root and the other options of ScanNet need --data scannet")
 
 
 @dataclass(frozen=True)
@@ -177,6 +193,9 @@ class TrainConfig:
     """Most views per step."""
     num_keypoints: int = 320
     """Points per image in training."""
+    teacher: Literal["superpoint", "aliked", "disk", "xfeat"] | None = None
+    """Whose interest points the detector learns to find (the paper: SuperPoint's), with weights
+    from --teacher-weights; Shi-Tomasi corners without one."""
     pose_noise: tuple[float, float] = (0.004, 0.0015)
     """Standard deviation of the sources' pose errors: metres, radians."""
     clip_gradient: float = 5.0
@@ -189,10 +208,11 @@ class TrainConfig:
     """bf16-mixed is faster where the processor has bfloat16; geometry stays in float32."""
 
     def __post_init__(self) -> None:
-        if not 2 <= self.min_views <= self.max_views <= self.data.num_views:
+        most = self.data.num_views if self.data.source == "rooms" else self.max_views
+        if not 2 <= self.min_views <= self.max_views <= most:
             raise ValueError(
                 f"views must satisfy 2 <= min_views <= max_views <= data.num_views, got "
-                f"{self.min_views}, {self.max_views}, {self.data.num_views}"
+                f"{self.min_views}, {self.max_views}, {most}"
             )
         for name in ("steps", "batch_size", "accumulate", "devices", "num_nodes"):
             if getattr(self, name) < 1:
@@ -234,6 +254,23 @@ def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
             value = _as_tuples(value)
         read[name] = value
     return kind(**read)
+
+
+def without_paths(config: TrainConfig) -> TrainConfig:
+    """The config as it may be shown to others: where files are is the machine's, and private.
+
+    Of split and skip files the names stay.
+    """
+    scannet = config.data.scannet
+    public = dataclasses.replace(
+        scannet,
+        root=None,
+        split=Path(scannet.split).name,
+        validation=None if scannet.validation is None else Path(scannet.validation).name,
+        skip=None if scannet.skip is None else Path(scannet.skip).name,
+    )
+    data = dataclasses.replace(config.data, cache=None, scannet=public)
+    return dataclasses.replace(config, data=data)
 
 
 def _as_tuples(value: Any) -> Any:

@@ -44,6 +44,7 @@ def training_losses(
     config: LossConfig,
     *,
     depth_range: tuple[float, float],
+    labels: Tensor | None = None,
     counts: Counts = WHOLE,
 ) -> Losses:
     """All terms for a batch, or for this process's part of one.
@@ -55,6 +56,8 @@ def training_losses(
         depth: ``(B, V, H, W)`` metres, 0 = unknown.
         config: weights of the terms.
         depth_range: as given to the network.
+        labels: of the detector, as for :func:`detector_loss`; Shi-Tomasi corners of the anchors
+            if not given.
         counts: how the number of places that a term is averaged over becomes that of the batch.
     """
     keypoints = prediction.keypoints
@@ -64,8 +67,10 @@ def training_losses(
     coarse, fine = depth_terms(
         dense, truth, depth_range=depth_range, decay=config.scale_decay, counts=counts
     )
+    if labels is None:
+        labels = detector_labels(images[:, 0])
     terms = {
-        "detector": F.cross_entropy(keypoints.logits, detector_labels(images[:, 0])),
+        "detector": detector_loss(keypoints.logits, labels),
         "match": match_loss(prediction.matches, targets, counts=counts),
         "point": point_loss(prediction.points, targets, counts=counts),
         "smoothness": smoothness_loss(prediction.depth, images[:, 0]),
@@ -82,6 +87,21 @@ def training_losses(
 def masked_mean(values: Tensor, mask: Tensor, counts: Counts = WHOLE) -> Tensor:
     """Mean of the values where the mask holds; 0 where it holds nowhere."""
     return torch.where(mask, values, 0.0).sum() / counts.divisor(mask.sum())
+
+
+def detector_loss(logits: Tensor, labels: Tensor) -> Tensor:
+    """Cross-entropy of which pixel of its cell is an interest point (paper: L_ip).
+
+    Cells are counted from the top left. The paper's heads have none for what the image's height
+    and width leave over beyond a multiple of 8; labels of those cells are not used.
+
+    Args:
+        logits: ``(B, 65, h, w)``; h is H/8 rounded up or down, w alike.
+        labels: ``(B, ceil(H/8), ceil(W/8))`` channels, or ``(B, 65, ceil(H/8), ceil(W/8))``
+            distributions over them.
+    """
+    rows, columns = logits.shape[-2:]
+    return F.cross_entropy(logits, labels[..., :rows, :columns])
 
 
 def match_loss(

@@ -1,16 +1,16 @@
 """The folder that the depth command fills: safe to kill, continue, share and refuse.
 
-Files in it are whole (`deltas_nets.atomic_files`), so a frame whose three files exist is
-finished, whenever the run before was killed. summary.json says what made them: written at the
-start (status ``running``) and at the end (``complete``). Several shards may fill one folder;
-each keeps its own summary.I-of-N.json beside the summary of all.
+Files in it are whole (`deltas_nets.atomic_files`), so a frame whose files all exist is
+finished, whenever the run before was killed. Where the network states no confidence there is no
+folder confidence. summary.json says what made the files: written at the start (status
+``running``) and at the end (``complete``). Several shards may fill one folder; each keeps its own
+summary.I-of-N.json beside the summary of all.
 """
 
 import json
 import os
-import re
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,14 @@ from deltas_nets.atomic_files import (
 )
 from deltas_nets.data.view_sets import ViewSet
 from deltas_nets.errors import UserError
+from deltas_nets.summary import (
+    SHARD_SUMMARY,
+    SUMMARY,
+    WRITER,
+    difference,
+    read_summary,
+    shard_summary,
+)
 
 __all__ = [
     "OutputFolder",
@@ -43,10 +51,6 @@ __all__ = [
     "write_points_ply",
 ]
 
-WRITER = "deltas depth"
-"""Stands in summary.json and tells our folders from others."""
-SUMMARY = "summary.json"
-SHARD_SUMMARY = re.compile(r"summary\.\d+-of-\d+\.json")
 KINDS = {"depth": ".png", "confidence": ".png", "points": ".ply"}
 
 FrameId = int | str
@@ -56,9 +60,16 @@ class OutputFolder:
     """A folder being filled by one run; made by `prepare_output`."""
 
     def __init__(
-        self, path: Path, *, head: dict[str, Any], frames: dict[str, Any], shard: tuple[int, int]
+        self,
+        path: Path,
+        *,
+        kinds: Sequence[str],
+        head: dict[str, Any],
+        frames: dict[str, Any],
+        shard: tuple[int, int],
     ) -> None:
         self.path = path
+        self.kinds = kinds
         self._head = head
         self._frames = frames  # records of this run and of those it continues, by id
         self._shard = shard
@@ -69,21 +80,36 @@ class OutputFolder:
 
     def is_finished(self, id: FrameId) -> bool:
         """Whether all files of a frame exist, and therefore are complete."""
-        return all(self.file(kind, id).exists() for kind in KINDS)
+        return all(self.file(kind, id).exists() for kind in self.kinds)
 
     def write_frame(
         self,
         id: FrameId,
         *,
         depth: ArrayLike,
-        probability: ArrayLike,
+        probability: ArrayLike | None,
         points: ArrayLike,
         colors: ArrayLike,
         record: Mapping[str, Any],
     ) -> None:
-        """Write a frame's three files; ``record`` (status, times) goes to the summary."""
+        """Write a frame's files; ``record`` (status, times) goes to the summary.
+
+        Args:
+            id: of the frame.
+            depth: ``(H, W)`` metres.
+            probability: ``(H, W)`` in [0, 1]; None where the folder holds no confidence.
+            points: ``(N, 3)`` metres.
+            colors: ``(N, 3)`` uint8.
+            record: goes to the summary.
+
+        Raises:
+            ValueError: a probability is missing, or there is one too many.
+        """
+        if (probability is not None) != ("confidence" in self.kinds):
+            raise ValueError(f"the folder holds {', '.join(self.kinds)}")
         write_points_ply(self.file("points", id), points, colors)
-        write_confidence_png(self.file("confidence", id), probability)
+        if probability is not None:
+            write_confidence_png(self.file("confidence", id), probability)
         write_depth_png(self.file("depth", id), depth)
         self._frames[str(id)] = dict(record)
 
@@ -103,7 +129,7 @@ class OutputFolder:
         if self._shard[1] == 1:
             write_json(self.path / SUMMARY, content)
             return
-        write_json(_shard_summary(self.path, self._shard), content)
+        write_json(shard_summary(self.path, self._shard), content)
         # Others may finish between our reading and our writing. Who writes last reads once
         # more, so the summary that stays has seen everything.
         parts = self._parts()
@@ -116,12 +142,12 @@ class OutputFolder:
     def _parts(self) -> list[dict[str, Any]]:
         """Summaries of the shards that work with our settings."""
         count = self._shard[1]
-        paths = [_shard_summary(self.path, (index, count)) for index in range(1, count + 1)]
-        parts = [part for path in paths if (part := _read_summary(path)) is not None]
+        paths = [shard_summary(self.path, (index, count)) for index in range(1, count + 1)]
+        parts = [part for path in paths if (part := read_summary(path)) is not None]
         return [part for part in parts if part["settings"] == self._head["settings"]]
 
     def _merged(self, own: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, Any]:
-        earlier = _read_summary(self.path / SUMMARY)
+        earlier = read_summary(self.path / SUMMARY)
         frames: dict[str, Any] = {}
         if earlier is not None and earlier["settings"] == self._head["settings"]:
             frames |= earlier["frames"]
@@ -139,6 +165,7 @@ def prepare_output(
     forbidden: Path | None = None,
     shard: tuple[int, int] = (1, 1),
     frame_ids: Iterable[FrameId] = (),
+    confidence: bool = True,
     head: Mapping[str, Any] | None = None,
 ) -> OutputFolder:
     """Make or continue a folder for outputs, and write its summary with status ``running``.
@@ -152,6 +179,7 @@ def prepare_output(
         forbidden: the capture. Its own depth/ would be overwritten, so it is never an output.
         shard: which of how many runs that fill the folder this is, from 1.
         frame_ids: the frames of this run: what ``overwrite`` removes where others work too.
+        confidence: whether maps of it are written, too.
         head: goes to the summary beside the settings (versions, counts of lost frames).
 
     Returns:
@@ -162,6 +190,7 @@ def prepare_output(
             settings. Nothing in it has been changed then.
     """
     out, frame_ids = Path(out), list(frame_ids)
+    kinds = [kind for kind in KINDS if confidence or kind != "confidence"]
     wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
     if forbidden is not None and out.resolve() == forbidden.resolve():
         what = "the output folder is the capture itself"
@@ -173,22 +202,24 @@ def prepare_output(
     # Listed before the summaries are read: what another shard has made by now has a summary.
     others = [name for name in sorted(os.listdir(out)) if not TEMPORARY.match(name)]
     summaries = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
-    earlier = [found for name in summaries if (found := _read_summary(out / name)) is not None]
+    earlier = [found for name in summaries if (found := read_summary(out / name)) is not None]
     if not overwrite:
         if others and not earlier:
             what = f"the output folder holds something else ({', '.join(others[:3])})"
             raise UserError(what, out, "name an empty folder, or add --overwrite")
         if earlier and earlier[0]["settings"] != wanted:
-            what = f"an earlier run had other settings ({_difference(earlier[0], wanted)})"
+            what = f"an earlier run had other settings ({difference(earlier[0], wanted)})"
             raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
-    own = _read_summary(out / SUMMARY if shard[1] == 1 else _shard_summary(out, shard))
+    own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
     frames = {} if overwrite or own is None else dict(own["frames"])
     folder = OutputFolder(
         out,
+        kinds=kinds,
         head={
             "writer": WRITER,
             "status": "running",
             **(head or {}),
+            "files": kinds,
             "settings": wanted,
             "anchors": frame_ids,
         },
@@ -205,7 +236,7 @@ def prepare_output(
         if shard[1] == 1:
             _remove_temporary(out)
         folder.write_summary("running")
-        for kind in KINDS:
+        for kind in kinds:
             (out / kind).mkdir(exist_ok=True)
     except OSError as error:
         raise cannot_write(Path(error.filename or out), error) from error
@@ -234,7 +265,7 @@ def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
     Raises:
         UserError: no run of `deltas depth` did.
     """
-    summary = _read_summary(out / SUMMARY)
+    summary = read_summary(out / SUMMARY)
     if summary is None or "view_sets" not in summary["settings"]:
         raise UserError("no run of deltas depth is recorded", out / SUMMARY, "run it first")
     return tuple(
@@ -244,35 +275,6 @@ def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
 
 def _file(out: Path, kind: str, id: FrameId) -> Path:
     return out / kind / f"{id}{KINDS[kind]}"
-
-
-def _shard_summary(out: Path, shard: tuple[int, int]) -> Path:
-    return out / f"summary.{shard[0]}-of-{shard[1]}.json"
-
-
-def _read_summary(path: Path) -> dict[str, Any] | None:
-    """A summary of ours; None where there is none."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if not isinstance(content, dict) or content.get("writer") != WRITER:
-        return None
-    dicts = all(isinstance(content.get(key), dict) for key in ("settings", "frames"))
-    return content if dicts else None
-
-
-def _difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """The settings that differ, as the user would say it: ``views was 3, is 5``."""
-    before = earlier["settings"]
-    names = sorted(before.keys() | wanted.keys())
-    changed = [name for name in names if before.get(name) != wanted.get(name)]
-    words = []
-    for name in changed[:3]:
-        was, now = json.dumps(before.get(name)), json.dumps(wanted.get(name))
-        short = len(was) + len(now) < 60
-        words.append(f"{name} was {was}, is {now}" if short else f"{name} differs")
-    return "; ".join(words) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
 
 
 def _remove_frames(out: Path, ids: Iterable[FrameId]) -> None:

@@ -1,7 +1,6 @@
-"""From posed frames to depth maps: one frame, or a whole capture into a folder."""
+"""From posed frames to a depth map."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,11 +10,14 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from deltas_geom import PosedViews, unproject
+from deltas_nets import published
 from deltas_nets.data.capture import Capture, Frame
-from deltas_nets.data.sample import fit_work_size, load_views, resize_image
+from deltas_nets.data.sample import anchor_views, fit_work_size, resize_image
 from deltas_nets.data.view_sets import ViewSet
-from deltas_nets.network.deltas import Deltas, DepthPrediction
-from deltas_nets.outputs import OutputFolder
+from deltas_nets.encoded_frames import EncodedFrames
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas, DepthPrediction, with_batch_dims
+from deltas_nets.reference import ReferenceNetwork
 
 WORK_PIXELS = 120_000
 """Pixels of the image that the network sees, unless a size is given; see decision 5."""
@@ -47,17 +49,6 @@ class PredictConfig:
             raise ValueError(f"--min-confidence must be within 0 to 1, got {self.min_confidence}")
 
 
-SECONDS_BETWEEN_SUMMARIES = 5.0
-
-
-class Counts(NamedTuple):
-    """What became of the view sets: maps written, kept from before, and written blindly."""
-
-    written: int
-    kept: int
-    blind: int
-
-
 class FrameDepth(NamedTuple):
     """Depth of one frame.
 
@@ -80,23 +71,153 @@ class FrameDepth(NamedTuple):
     views: PosedViews
 
 
-@torch.inference_mode()
-def predict_frame(model: Deltas, frames: Sequence[Frame], config: PredictConfig) -> FrameDepth:
-    """Depth of the first frame from all of them.
+class KeypointDepths(NamedTuple):
+    """Triangulated depth of an anchor's keypoints.
+
+    Attributes:
+        pixels: ``(N, 2)`` at the size that the network works at.
+        depth: ``(N,)`` metres, 0 where there is none.
+        image_size: (height, width) of that size.
+    """
+
+    pixels: torch.Tensor
+    depth: torch.Tensor
+    image_size: tuple[int, int]
+
+
+class DepthMap(NamedTuple):
+    """What any network says of a frame: what is written and scored.
+
+    Attributes:
+        depth: ``(H, W)`` float32 metres; 0 where there is none.
+        confidence: ``(H, W)`` float32 as in `FrameDepth`; None where the network states none.
+        points: ``(N, 3)`` in the capture's world, metres.
+        colors: ``(N, 3)`` uint8.
+        keypoints: the points that the map rests on.
+    """
+
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32] | None
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    keypoints: KeypointDepths
+
+
+def check_asked(
+    network: Deltas | ReferenceNetwork,
+    config: PredictConfig,
+    capture: Capture,
+    view_sets: Sequence[ViewSet],
+) -> None:
+    """Whether a network can do what it is asked for; networks of deltas can do all of it.
 
     Args:
-        model: a trained network, on any device.
+        network: that is to predict.
+        config: sizes, range, confidence.
+        capture: the frames.
+        view_sets: anchors and sources.
+
+    Raises:
+        UserError: the published network, which has one depth range and one camera and states no
+            confidence, is asked for others.
+    """
+    if not isinstance(network, ReferenceNetwork):
+        return
+    if config.depth_range != published.DEPTH_RANGE:
+        near, far = published.DEPTH_RANGE
+        raise UserError(
+            f"the published network searches {near:g} to {far:g} m", "--depth-range", "leave it out"
+        )
+    if config.min_confidence > 0:
+        raise UserError(
+            "the published network states no confidence", "--min-confidence", "leave it out"
+        )
+    work_size = config.work_size or published.WORK_SIZE
+    published.check_work_size(work_size)
+    for views in view_sets:
+        published.check_cameras(frames_of(capture, views), work_size=work_size)
+
+
+def states_confidence(network: Deltas | ReferenceNetwork) -> bool:
+    """Whether maps of a network come with a confidence."""
+    return not isinstance(network, ReferenceNetwork)
+
+
+def predict_map(
+    network: EncodedFrames | ReferenceNetwork, frames: Sequence[Frame], config: PredictConfig
+) -> DepthMap:
+    """Depth of the first frame from all of them, by a network of either kind.
+
+    Args:
+        network: on any device, from :func:`remembering`; asked for what it can do
+            (:func:`check_asked`).
         frames: the anchor and its sources.
         config: sizes, range, confidence.
 
     Raises:
         UserError: an image cannot be read.
     """
-    device = next(model.parameters()).device
+    if isinstance(network, ReferenceNetwork):
+        return _published_map(network, frames, config)
+    result = predict_frame(network, frames, config)
+    keypoints = keypoint_depths(result.prediction)
+    return DepthMap(result.depth, result.confidence, result.points, result.colors, keypoints)
+
+
+def keypoint_depths(prediction: DepthPrediction) -> KeypointDepths:
+    """The triangulated points of a prediction without batch dims."""
+    return KeypointDepths(
+        prediction.keypoints.pixels,
+        prediction.points.depth[0],
+        (prediction.depth.shape[-2], prediction.depth.shape[-1]),
+    )
+
+
+def _published_map(
+    network: ReferenceNetwork, frames: Sequence[Frame], config: PredictConfig
+) -> DepthMap:
+    work_size = config.work_size or published.WORK_SIZE
+    found = published.predict_published(network, frames, work_size=work_size)
+    size = config.size or frames[0].image_size
+    depth = np.maximum(_resized(found.depth, size), 0)  # below 0 it is no depth
+    points, colors = _point_cloud(frames[0], depth, size, work_size)
+    keypoints = KeypointDepths(found.pixels, found.point_depth, work_size)
+    return DepthMap(depth, None, points, colors, keypoints)
+
+
+def remembering(network: Deltas | ReferenceNetwork) -> EncodedFrames | ReferenceNetwork:
+    """The network for many view sets of one capture: it encodes every frame once.
+
+    The published network looks at all images of a view set together, so it remembers none.
+    """
+    return EncodedFrames(network) if isinstance(network, Deltas) else network
+
+
+@torch.inference_mode()
+def predict_frame(
+    model: Deltas | EncodedFrames, frames: Sequence[Frame], config: PredictConfig
+) -> FrameDepth:
+    """Depth of the first frame from all of them.
+
+    Args:
+        model: a trained network, on any device; or one that remembers the frames it has seen.
+        frames: the anchor and its sources.
+        config: sizes, range, confidence.
+
+    Raises:
+        UserError: an image cannot be read.
+    """
+    encode = model if isinstance(model, EncodedFrames) else EncodedFrames(model)
+    device = next(encode.model.parameters()).device
     anchor = frames[0]
     work_size = config.work_size or fit_work_size(anchor.image_size, max_pixels=WORK_PIXELS)
-    images, views = load_views(frames, work_size=work_size)
-    prediction = model(images.to(device), views.to(device), config.depth_range)
+    images, encoded = encode(frames, work_size=work_size)
+    views = anchor_views(frames, work_size=work_size)
+    of_one = PosedViews(*(part[None] for part in views.to(device)))
+    prediction = with_batch_dims(
+        encode.model.from_encoded(encoded, of_one, config.depth_range, image_size=work_size),
+        torch.Size(),
+    )
     size = config.size or anchor.image_size
     depth = _resized(prediction.depth, size)
     confidence = _resized(prediction.confidence(), size)
@@ -130,76 +251,6 @@ def _point_cloud(
     return points.numpy()[known].astype(np.float32), colors[known]
 
 
-def predict_capture(
-    model: Deltas,
-    capture: Capture,
-    view_sets: Sequence[ViewSet],
-    folder: OutputFolder,
-    config: PredictConfig,
-    *,
-    report: Callable[[str], None] = lambda _: None,
-) -> Counts:
-    """Write depth, confidence and points of every view set that is not finished yet.
-
-    Args:
-        model: a trained network.
-        capture: the frames.
-        view_sets: anchors and sources.
-        folder: from :func:`deltas_nets.outputs.prepare_output`.
-        config: sizes, range, confidence.
-        report: called with the id of every finished frame.
-
-    Returns:
-        How many maps were written, kept, and written without a single triangulated point.
-
-    Raises:
-        UserError: a file cannot be read or written. What is finished by then stays, and is
-            kept when the same is asked for again.
-    """
-    counts = Counts(0, 0, 0)
-    began = recorded = time.perf_counter()
-    status = "stopped"
-    try:
-        for views in view_sets:
-            if folder.is_finished(views.anchor):
-                folder.keep_frame(views.anchor)
-                counts = counts._replace(kept=counts.kept + 1)
-            else:
-                blind = _predict_into(model, capture, views, folder, config)
-                counts = Counts(counts.written + 1, counts.kept, counts.blind + blind)
-            if time.perf_counter() - recorded > SECONDS_BETWEEN_SUMMARIES:
-                folder.write_summary("running")
-                recorded = time.perf_counter()
-            report(str(views.anchor))
-        status = "complete"
-    finally:
-        folder.write_summary(status, seconds=round(time.perf_counter() - began, 3))
-    return counts
-
-
-def _predict_into(
-    model: Deltas,
-    capture: Capture,
-    views: ViewSet,
-    folder: OutputFolder,
-    config: PredictConfig,
-) -> bool:
-    """Write one view set's outputs; whether nothing could be triangulated."""
-    started = time.perf_counter()
-    frames = [capture.frame(id) for id in (views.anchor, *views.sources)]
-    result = predict_frame(model, frames, config)
-    valid = int(result.prediction.points.valid.sum())
-    folder.write_frame(
-        views.anchor,
-        depth=result.depth,
-        probability=result.confidence,
-        points=result.points,
-        colors=result.colors,
-        record={
-            "status": "ok" if valid else "no point triangulated",
-            "sources": views.sources,
-            "valid_points": valid,
-            "seconds": round(time.perf_counter() - started, 4),
-        },
-    )
-    return valid == 0
+def frames_of(capture: Capture, views: ViewSet) -> list[Frame]:
+    """The anchor, then its sources."""
+    return [capture.frame(id) for id in (views.anchor, *views.sources)]

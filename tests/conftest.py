@@ -1,5 +1,6 @@
 """What all tests share: hypothesis profiles, the dtypes, the real captures."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,10 @@ settings.register_profile(
 settings.load_profile("same")
 # Test tensors are small: a second thread costs more than it brings.
 torch.set_num_threads(1)
+# Commands that tests start share the cores with the other processes that run tests.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, share)))
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])

@@ -162,7 +162,7 @@ def image_size_of(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def ids_in_words(ids: Iterable[int], limit: int = 5) -> str:
+def ids_in_words(ids: Iterable[int | str], limit: int = 5) -> str:
     """A few ids for an error message.
 
     Example:

@@ -12,7 +12,14 @@ from deltas_geom.pixels import resize_intrinsics
 from deltas_geom.views import PosedViews
 from deltas_nets.data.capture import FloatArray, Frame
 
-__all__ = ["depth_at_image", "fit_work_size", "load_views", "resize_image"]
+__all__ = [
+    "anchor_views",
+    "depth_at_image",
+    "fit_work_size",
+    "load_image",
+    "load_views",
+    "resize_image",
+]
 
 SMALLEST_BASELINE = 1e-6
 """Metres; cameras nearer to each other stand in one place, as files have six digits."""
@@ -28,17 +35,38 @@ def load_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> tuple[
         work_size: (height, width) of the result; images may differ in size before.
 
     Returns:
-        Images ``(V, 3, H, W)`` float32 RGB in [0, 1], and views in the anchor's coordinates
-        (its ``cam_from_world`` is the identity): K ``(V, 3, 3)``, poses ``(V, 4, 4)`` float32.
+        Images ``(V, 3, H, W)`` float32 RGB in [0, 1], and views as from :func:`anchor_views`.
 
     Raises:
         UserError: an image cannot be read.
     """
-    images, intrinsics, poses = [], [], []
+    images = torch.stack([load_image(frame, work_size=work_size) for frame in frames])
+    return images, anchor_views(frames, work_size=work_size)
+
+
+def load_image(frame: Frame, *, work_size: tuple[int, int]) -> Tensor:
+    """Image ``(3, H, W)`` float32 RGB in [0, 1] at the size the network sees.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    pixels = resize_image(frame.read_image(), work_size)
+    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().float() / 255
+
+
+def anchor_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> PosedViews:
+    """Cameras of a view set in the anchor's coordinates, for images of a size.
+
+    Args:
+        frames: the anchor, whose ``cam_from_world`` becomes the identity, then its sources.
+        work_size: (height, width) that the images are resized to.
+
+    Returns:
+        K ``(V, 3, 3)``, poses ``(V, 4, 4)``, float32.
+    """
+    intrinsics, poses = [], []
     world_from_anchor = _rigid_inverse(frames[0].cam_from_world)
     for frame in frames:
-        pixels = resize_image(frame.read_image(), work_size)
-        images.append(torch.from_numpy(pixels).permute(2, 0, 1))
         K = torch.from_numpy(frame.K.copy())
         intrinsics.append(resize_intrinsics(K, old_size=frame.image_size, new_size=work_size))
         # In float64, before the cast: float32 keeps 6 cm at 1000 km and 0.06 mm at 1 km, and
@@ -48,8 +76,7 @@ def load_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> tuple[
             cam_from_anchor[:3, 3] = 0  # rounding, which would pass for parallax
         poses.append(torch.from_numpy(cam_from_anchor))
     poses[0] = torch.eye(4, dtype=torch.float64)  # exactly, not but for rounding
-    views = PosedViews(torch.stack(intrinsics).float(), torch.stack(poses).float())
-    return torch.stack(images).float() / 255, views
+    return PosedViews(torch.stack(intrinsics).float(), torch.stack(poses).float())
 
 
 def resize_image(image: NDArray[np.uint8], new_size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -101,27 +128,34 @@ def fit_work_size(
     return best[1]
 
 
-def depth_at_image(frame: Frame) -> NDArray[np.float32]:
-    """Sensor depth on the pixel grid of the colour image.
+def depth_at_image(
+    frame: Frame, *, work_size: tuple[int, int] | None = None
+) -> NDArray[np.float32]:
+    """Sensor depth on the pixel grid of the colour image, or of that image resized.
 
     Nearest neighbour: between a near and a far surface there is nothing at their mean. The
     depth camera is taken to stand where the colour camera stands; without intrinsics of its
     own it sees the same field of view.
 
+    Args:
+        frame: one that has depth.
+        work_size: (height, width) of the resized image; ``frame.image_size`` if not given.
+
     Returns:
-        ``(H, W)`` float32 metres of ``frame.image_size``, 0 where unknown or not seen.
+        ``(H, W)`` float32 metres, 0 where unknown or not seen.
 
     Raises:
         UserError: the frame has no depth, or it cannot be read.
     """
     depth = frame.read_depth()
     depth_size = (depth.shape[0], depth.shape[1])
-    K = torch.from_numpy(frame.K.copy())
-    seen_K = resize_intrinsics(K, old_size=frame.image_size, new_size=depth_size).numpy()
+    height, width = size = frame.image_size if work_size is None else work_size
+    image_K = torch.from_numpy(frame.K.copy())
+    K = resize_intrinsics(image_K, old_size=frame.image_size, new_size=size).numpy()
+    seen_K = resize_intrinsics(image_K, old_size=frame.image_size, new_size=depth_size).numpy()
     depth_K = seen_K if frame.depth_K is None else frame.depth_K
-    height, width = frame.image_size
-    columns = _nearest(depth_K[0, 0] / frame.K[0, 0], frame.K[0, 2], depth_K[0, 2], width)
-    rows = _nearest(depth_K[1, 1] / frame.K[1, 1], frame.K[1, 2], depth_K[1, 2], height)
+    columns = _nearest(depth_K[0, 0] / K[0, 0], K[0, 2], depth_K[0, 2], width)
+    rows = _nearest(depth_K[1, 1] / K[1, 1], K[1, 2], depth_K[1, 2], height)
     seen_columns = (columns >= 0) & (columns < depth_size[1])
     seen_rows = (rows >= 0) & (rows < depth_size[0])
     columns, rows = columns.clip(0, depth_size[1] - 1), rows.clip(0, depth_size[0] - 1)

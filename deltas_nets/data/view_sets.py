@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from deltas_nets.data.capture import Capture, FloatArray, ids_in_words
 from deltas_nets.errors import UserError
 
-__all__ = ["ViewSet", "check_frames", "choose_view_sets", "read_view_sets"]
+__all__ = ["ViewSet", "check_frames", "choose_view_sets", "read_view_sets", "spread_sources"]
 
 PROBE_DEPTHS = (0.4, 0.8, 1.6)
 """Where surfaces may be, in working depths: overlap is the mean over these."""
@@ -132,7 +132,7 @@ def choose_view_sets(
         if acceptable.any():
             near, offsets = near[acceptable], offsets[acceptable]
             log_score = log_score[acceptable]
-        chosen = _spread(log_score, offsets, num_views - 1)
+        chosen = spread_sources(log_score, offsets, num_views - 1)
         view_sets.append(ViewSet(id, tuple(ids[near[index]] for index in chosen)))
     return tuple(view_sets)
 
@@ -279,11 +279,19 @@ def _rate(
     return score, acceptable
 
 
-def _spread(log_score: FloatArray, offsets: FloatArray, count: int) -> list[int]:
+def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> list[int]:
     """Greedily the best, each discounted by how nearly it repeats one that was chosen.
 
     A second view from the same place adds little; one from the opposite side sees what the
     first cannot, and its errors differ.
+
+    Args:
+        log_score: ``(C,)`` of the candidates, the more the better.
+        offsets: ``(C, 3)`` metres from the anchor.
+        count: how many are wanted.
+
+    Returns:
+        Indices of at most ``count`` candidates, best first.
     """
     lengths = np.linalg.norm(offsets, axis=-1, keepdims=True)
     directions = offsets / np.maximum(lengths, 1e-9)

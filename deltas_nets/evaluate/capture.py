@@ -5,46 +5,48 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from deltas_nets.data.capture import Capture
+from deltas_nets.data.capture import Capture, Frame
 from deltas_nets.data.sample import depth_at_image
 from deltas_nets.data.view_sets import ViewSet
+from deltas_nets.encoded_frames import EncodedFrames
 from deltas_nets.errors import UserError
-from deltas_nets.evaluate.depth_metrics import DepthMetrics, depth_metrics, mean_metrics
-from deltas_nets.evaluate.points import score_points
+from deltas_nets.evaluate.calibration import CalibrationMeter
+from deltas_nets.evaluate.points import score_keypoints
+from deltas_nets.evaluate.scores import CaptureScores as CaptureScores
+from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
+from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs import read_depth_png
-from deltas_nets.predict import PredictConfig, predict_frame
+from deltas_nets.predict import (
+    KeypointDepths,
+    PredictConfig,
+    keypoint_depths,
+    predict_frame,
+    predict_map,
+    remembering,
+)
+from deltas_nets.reference import ReferenceNetwork
 
 
-class CaptureScores(NamedTuple):
-    """Means over the view sets of a capture.
+class _Map(NamedTuple):
+    """A depth map, the points it rests on, and its uncertainty if the network states one.
 
     Attributes:
-        dense: of the depth maps.
-        median_scaled: the same after each map is scaled to the true median: what remains is
-            not the poses' scale.
-        sparse: of the triangulated points; None when maps from files are scored.
-        frames: Abs Rel of each anchor.
+        depth: ``(H, W)`` metres.
+        relative_std: ``(H, W)`` standard deviation as a share of the depth.
+        keypoints: with their depth.
     """
 
-    dense: DepthMetrics
-    median_scaled: DepthMetrics
-    sparse: DepthMetrics | None
-    frames: dict[str, float]
-
-
-class _FrameScores(NamedTuple):
-    dense: DepthMetrics
-    scaled: DepthMetrics
-    sparse: DepthMetrics | None
+    depth: NDArray[np.float32]
+    relative_std: NDArray[np.float32] | None
+    keypoints: KeypointDepths
 
 
 def evaluate_network(
-    model: Deltas,
+    network: Deltas | ReferenceNetwork,
     capture: Capture,
     view_sets: Sequence[ViewSet],
     config: PredictConfig,
@@ -54,7 +56,7 @@ def evaluate_network(
     """Predict every view set and score it.
 
     Args:
-        model: a trained network.
+        network: trained.
         capture: frames with sensor depth.
         view_sets: anchors and sources.
         config: as for prediction.
@@ -63,16 +65,37 @@ def evaluate_network(
     Raises:
         UserError: an anchor has no sensor depth, or none of it is in range.
     """
-    scores = {}
+    scores: dict[str, MapScores | None] = {}
+    meter = CalibrationMeter()
+    seer = remembering(network)
     for views in view_sets:
         anchor = capture.frame(views.anchor)
         truth = depth_at_image(anchor)
         frames = [anchor, *(capture.frame(id) for id in views.sources)]
-        result = predict_frame(model, frames, config)
-        sparse = score_points(result.prediction, truth, config.depth_range)
-        scores[str(views.anchor)] = _score(result.depth, truth, config.depth_range, sparse)
+        found = _predict(seer, frames, config)
+        sparse = score_keypoints(found.keypoints, truth, config.depth_range)
+        scores[str(views.anchor)] = score_map(found.depth, truth, config.depth_range, sparse)
+        if found.relative_std is not None:
+            true = resize_nearest(truth, (found.depth.shape[0], found.depth.shape[1]))
+            meter.add(found.depth, found.relative_std, true, depth_range=config.depth_range)
         report(str(views.anchor))
-    return _mean(scores, capture.path)
+    return _mean(scores, capture.path, meter)
+
+
+def _predict(
+    network: EncodedFrames | ReferenceNetwork, frames: Sequence[Frame], config: PredictConfig
+) -> _Map:
+    if isinstance(network, ReferenceNetwork):
+        stated = predict_map(network, frames, config)
+        return _Map(stated.depth, None, stated.keypoints)
+    result = predict_frame(network, frames, config)
+    prediction = result.prediction
+    # In logs, as the network forms it: the order of neighbours stays.
+    log_std = (prediction.std / prediction.depth).log()
+    size = (result.depth.shape[0], result.depth.shape[1])
+    resized = F.interpolate(log_std[None], size=size, mode="bilinear", align_corners=False)
+    relative_std = resized[0, 0].exp().float().cpu().numpy()
+    return _Map(result.depth, relative_std, keypoint_depths(prediction))
 
 
 def evaluate_files(
@@ -93,7 +116,7 @@ def evaluate_files(
     Raises:
         UserError: a map is missing or cannot be read.
     """
-    scores = {}
+    scores: dict[str, MapScores | None] = {}
     for views in view_sets:
         file = predictions / "depth" / f"{views.anchor}.png"
         try:
@@ -103,47 +126,15 @@ def evaluate_files(
                 f"no depth map ({error.strerror or error})", file, "run deltas depth first"
             ) from error
         truth = depth_at_image(capture.frame(views.anchor))
-        scores[str(views.anchor)] = _score(predicted, truth, depth_range, None)
-    return _mean(scores, capture.path)
+        scores[str(views.anchor)] = score_map(predicted, truth, depth_range, None)
+    return _mean(scores, capture.path, CalibrationMeter())
 
 
-def _score(
-    predicted: NDArray[np.float32],
-    truth: NDArray[np.float32],
-    depth_range: tuple[float, float],
-    sparse: DepthMetrics | None,
-) -> _FrameScores | None:
-    truth = resize_nearest(truth, (predicted.shape[0], predicted.shape[1]))
-    dense = depth_metrics(predicted, truth, depth_range=depth_range)
-    if dense is None:
-        return None
-    near, far = depth_range
-    both = (truth >= near) & (truth <= far) & (predicted > 0)
-    scale = float(np.median(truth[both] / predicted[both])) if both.any() else 1.0
-    scaled = depth_metrics(predicted * scale, truth, depth_range=depth_range)
-    assert scaled is not None
-    return _FrameScores(dense, scaled, sparse)
-
-
-def resize_nearest(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Depth ``(H, W)`` at another size: the value of the pixel that holds each new centre."""
-    if image.shape == size:
-        return image
-    resized = F.interpolate(torch.from_numpy(image)[None, None], size=size, mode="nearest-exact")
-    array: NDArray[np.float32] = resized[0, 0].numpy()
-    return array
-
-
-def _mean(scores: dict[str, _FrameScores | None], path: Path) -> CaptureScores:
-    found = {id: score for id, score in scores.items() if score is not None}
-    if not found:
+def _mean(
+    scores: dict[str, MapScores | None], path: Path, meter: CalibrationMeter
+) -> CaptureScores:
+    if all(score is None for score in scores.values()):
         raise UserError(
             "no anchor has true depth in range", path, "name a capture with sensor depth"
         )
-    sparse = [score.sparse for score in found.values() if score.sparse is not None]
-    return CaptureScores(
-        dense=mean_metrics([score.dense for score in found.values()]),
-        median_scaled=mean_metrics([score.scaled for score in found.values()]),
-        sparse=mean_metrics(sparse) if sparse else None,
-        frames={id: score.dense.abs_rel for id, score in found.items()},
-    )
+    return mean_scores(scores, None if meter.empty else meter.result())

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, depth_metrics
 from deltas_nets.network.deltas import DepthPrediction
+from deltas_nets.predict import KeypointDepths, keypoint_depths
 from deltas_nets.targets import read_nearest
 
 
@@ -20,7 +21,14 @@ def score_points(
         truth: ``(H, W)`` true depth at any size, metres, 0 = unknown.
         depth_range: (near, far) metres.
     """
-    predicted, true = point_depths(prediction, truth)
+    return score_keypoints(keypoint_depths(prediction), truth, depth_range)
+
+
+def score_keypoints(
+    keypoints: KeypointDepths, truth: NDArray[np.float32], depth_range: tuple[float, float]
+) -> DepthMetrics | None:
+    """The same of points whose network need not be one of deltas."""
+    predicted, true = _depths(keypoints, truth)
     return depth_metrics(predicted, true, depth_range=depth_range)
 
 
@@ -35,7 +43,11 @@ def median_point_error(
 
 def point_depths(prediction: DepthPrediction, truth: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
     """Predicted (0 where not valid) and true depth of the N keypoints, metres."""
-    height, width = prediction.depth.shape[-2:]
+    return _depths(keypoint_depths(prediction), truth)
+
+
+def _depths(keypoints: KeypointDepths, truth: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
+    height, width = keypoints.image_size
     scale = torch.tensor([truth.shape[1] / width, truth.shape[0] / height])
-    places = (prediction.keypoints.pixels.cpu() + 0.5) * scale - 0.5
-    return prediction.points.depth[0].cpu(), read_nearest(torch.from_numpy(truth), places)
+    places = (keypoints.pixels.cpu() + 0.5) * scale - 0.5
+    return keypoints.depth.cpu(), read_nearest(torch.from_numpy(truth), places)

@@ -1,32 +1,167 @@
-"""How a network does on procedural rooms: quick, exact truth, for use during training."""
+"""How a network does on procedural rooms: exact truth, and no training sees them."""
+
+from collections.abc import Callable
+from typing import Literal, Protocol
 
 import torch
 from torch import nn
+from torch.utils.data import Dataset
 
 from deltas_geom import PosedViews
+from deltas_nets.config import TrainConfig
+from deltas_nets.data.augment import Photometry, disturb_poses
+from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
+from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
+from deltas_nets.evaluate.points import score_points
+from deltas_nets.evaluate.scores import CaptureScores, MapScores, mean_scores, score_map
+from deltas_nets.network.deltas import Deltas, DepthPrediction
 from deltas_nets.targets import read_nearest
+
+EVALUATION_SEEDS, CALIBRATION_SEEDS = range(500), range(500, 1000)
+"""Rooms to report on and rooms to calibrate with; those of training have seeds from 1000."""
+
+POSE_NOISE = TrainConfig().pose_noise
+
+Conditions = Literal["ideal", "real"]
+
+
+class RoomViews(Protocol):
+    """Rooms by number: images uint8 ``(V, 3, H, W)``, cameras, depth ``(V, H, W)``."""
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, index: int) -> PosedImages: ...
+
+
+class DisturbedRooms(Dataset[PosedImages]):
+    """Rooms as cameras and trackers give them: the light, blur, noise and poses of training.
+
+    Args:
+        rooms: as rendered; their seeds decide what happens to them.
+        pose_noise: standard deviations of the sources' poses, metres and radians per axis.
+    """
+
+    def __init__(self, rooms: Rooms, pose_noise: tuple[float, float] = POSE_NOISE) -> None:
+        self.rooms = rooms
+        self.pose_noise = pose_noise
+        self.photometry = Photometry()
+
+    def __len__(self) -> int:
+        return len(self.rooms)
+
+    def __getitem__(self, index: int) -> PosedImages:
+        room, seed = self.rooms[index], self.rooms.seed + index
+        images = self.photometry(room.images[None].float() / 255, seed)[0]
+        views = disturb_poses(
+            PosedViews(*(tensor[None] for tensor in room.views)),
+            self.pose_noise,
+            torch.Generator().manual_seed(seed),
+        )
+        views = PosedViews(*(tensor[0] for tensor in views))
+        return PosedImages((images * 255).round().to(torch.uint8), views, room.depth)
+
+
+def held_out_rooms(
+    count: int,
+    seeds: range,
+    *,
+    num_views: int = 3,
+    image_size: tuple[int, int] = (288, 384),
+    conditions: Conditions = "real",
+) -> RoomViews:
+    """The first of the rooms of some seeds.
+
+    Args:
+        count: how many.
+        seeds: ``EVALUATION_SEEDS`` or ``CALIBRATION_SEEDS``.
+        num_views: V, the anchor first.
+        image_size: height, width.
+        conditions: "ideal" as rendered, "real" as :class:`DisturbedRooms`.
+
+    Raises:
+        ValueError: there are not so many.
+    """
+    if not 1 <= count <= len(seeds):
+        raise ValueError(f"the number of rooms must be within 1 to {len(seeds)}, got {count}")
+    rooms = Rooms(count, seed=seeds.start, num_views=num_views, image_size=image_size)
+    return DisturbedRooms(rooms) if conditions == "real" else rooms
+
+
+def score_rooms(
+    model: Deltas,
+    rooms: RoomViews,
+    *,
+    depth_range: tuple[float, float],
+    report: Callable[[str], None] = lambda _: None,
+) -> CaptureScores:
+    """Score the maps of all rooms, view 0 of each as anchor; rooms are named by their number."""
+    meter, scores = CalibrationMeter(), dict[str, MapScores | None]()
+    for number in range(len(rooms)):
+        room = rooms[number]
+        prediction = predict_room(model, room, depth_range)
+        truth = room.depth[0].numpy()
+        depth = prediction.depth[0].cpu().numpy()
+        sparse = score_points(prediction, truth, depth_range)
+        scores[str(number)] = score_map(depth, truth, depth_range, sparse)
+        _measure(prediction, room, meter, depth_range)
+        report(str(number))
+    return mean_scores(scores, None if meter.empty else meter.result())
+
+
+def measure_rooms(
+    model: Deltas,
+    rooms: RoomViews,
+    meter: CalibrationMeter,
+    *,
+    depth_range: tuple[float, float],
+    report: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Let a meter look at the maps of all rooms."""
+    for number in range(len(rooms)):
+        room = rooms[number]
+        _measure(predict_room(model, room, depth_range), room, meter, depth_range)
+        report(str(number))
 
 
 @torch.no_grad()
+def predict_room(
+    model: nn.Module, room: PosedImages, depth_range: tuple[float, float]
+) -> DepthPrediction:
+    """Depth of view 0, on the model's device."""
+    device = next(model.parameters()).device
+    prediction: DepthPrediction = model(
+        (room.images.float() / 255).to(device),
+        PosedViews(*(tensor.to(device) for tensor in room.views)),
+        depth_range,
+    )
+    return prediction
+
+
+def _measure(
+    prediction: DepthPrediction,
+    room: PosedImages,
+    meter: CalibrationMeter,
+    depth_range: tuple[float, float],
+) -> None:
+    relative_std = prediction.std / prediction.depth
+    meter.add(
+        prediction.depth[0].cpu(), relative_std[0].cpu(), room.depth[0], depth_range=depth_range
+    )
+
+
 def evaluate_rooms(
-    model: nn.Module, rooms: Rooms, *, depth_range: tuple[float, float]
+    model: nn.Module, rooms: RoomViews, *, depth_range: tuple[float, float]
 ) -> dict[str, float]:
-    """Errors of dense maps and of all sparse points, view 0 of each room as anchor.
+    """Errors of dense maps and of all sparse points, quick, for use during training.
 
     Returns:
         abs_rel and delta1 of the dense map; sparse, the median relative error of the points.
     """
-    device = next(model.parameters()).device
     dense, sparse = [], []
     for index in range(len(rooms)):
         room = rooms[index]
-        prediction = model(
-            (room.images.float() / 255).to(device),
-            PosedViews(*(tensor.to(device) for tensor in room.views)),
-            depth_range,
-        )
+        prediction = predict_room(model, room, depth_range)
         found = depth_metrics(prediction.depth[0].cpu(), room.depth[0], depth_range=depth_range)
         if found is not None:
             dense.append(found)

@@ -1,5 +1,6 @@
 """DELTAS: the method whole. Start reading here."""
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -16,9 +17,11 @@ from deltas_geom import (
 from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
 from deltas_nets.config import NetworkConfig
 from deltas_nets.network.build import build_stages
+from deltas_nets.network.calibration import SpreadCalibration
 from deltas_nets.network.densifier import DenseDepth
 from deltas_nets.network.detector import Keypoints
-from deltas_nets.network.layers import upsample_like
+from deltas_nets.network.encoded import Encoded
+from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.matcher import Posterior
 
 
@@ -41,7 +44,7 @@ class DepthPrediction(NamedTuple):
 
     Attributes:
         depth: ``(*B, 1, H, W)`` metres along z.
-        std: ``(*B, 1, H, W)`` its standard deviation, metres.
+        std: ``(*B, 1, H, W)`` its standard deviation, metres, calibrated if the weights are.
         keypoints: N points of the anchor.
         matches: where they are seen in all views.
         points: triangulated, in the world.
@@ -89,6 +92,7 @@ class Deltas(nn.Module):
         self.descriptor = stages.descriptor
         self.matcher = stages.matcher
         self.densifier = stages.densifier
+        self.calibration = SpreadCalibration()
 
     def forward(
         self,
@@ -120,53 +124,91 @@ class Deltas(nn.Module):
         if images.shape[-4] < 2:
             raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
         batch, size = images.shape[:-4], (images.shape[-2], images.shape[-1])
-        images = images.reshape(-1, *images.shape[-4:])
         flat = PosedViews(
             *(t.expand(*batch, *t.shape[-3:]).reshape(-1, *t.shape[-3:]) for t in views)
         )
-        if shift is not None:
-            shift = shift.reshape(-1, 2)
-
-        features = self.encoder(images)
-        keypoints = self.detector(
-            features, image_size=size, num_keypoints=num_keypoints, shift=shift
+        prediction = self.from_encoded(
+            self.encode(images.reshape(-1, *images.shape[-4:])),
+            flat,
+            depth_range,
+            image_size=size,
+            num_keypoints=num_keypoints,
+            shift=None if shift is None else shift.reshape(-1, 2),
         )
-        descriptors = self.descriptor(features)
+        return with_batch_dims(prediction, batch)
+
+    def encode(self, images: Tensor) -> Encoded:
+        """The part that knows one image at a time: of a video, once per frame is enough.
+
+        Args:
+            images: ``(B, V, 3, H, W)`` RGB in [0, 1].
+        """
+        features = self.encoder(images)
+        return Encoded(features, self.descriptor(features))
+
+    def from_encoded(
+        self,
+        encoded: Encoded,
+        views: PosedViews,
+        depth_range: tuple[float, float] = (0.5, 10.0),
+        *,
+        image_size: tuple[int, int],
+        num_keypoints: int | None = None,
+        shift: Tensor | None = None,
+    ) -> DepthPrediction:
+        """Predict the depth of view 0 of encoded images.
+
+        Args:
+            encoded: from :meth:`encode`, of B x V images.
+            views: their cameras, ``(B, V)``.
+            depth_range: (near, far) of the search, metres.
+            image_size: (height, width) of the images.
+            num_keypoints: instead of the config's.
+            shift: ``(B, 2)`` as for :meth:`forward`.
+        """
+        features, descriptors = encoded
+        keypoints = self.detector(
+            features, image_size=image_size, num_keypoints=num_keypoints, shift=shift
+        )
         # Geometry keeps full precision whatever the network around it runs in.
-        with torch.autocast(images.device.type, enabled=False):
+        with torch.autocast(views.K.device.type, enabled=False):
             matched = self.matcher(
-                keypoints.pixels, descriptors, flat, image_size=size, depth_range=depth_range
+                keypoints.pixels,
+                descriptors,
+                views,
+                image_size=image_size,
+                depth_range=depth_range,
             )
             matches = matched.matches
-            points = triangulate(flat.proj, matches.pixels, matches.weights, matches.mask)
+            points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
             depth = points.depth[:, 0]
             near, far = 0.5 * depth_range[0], 2 * depth_range[1]
             sparse = rasterize_depth(
                 keypoints.pixels,
                 depth,
-                image_size=size,
+                image_size=image_size,
                 mask=points.valid & (depth > near) & (depth < far),
                 weights=matched.confidence,
                 reduce="mean",
             )
         dense = self.densifier(features, sparse)
 
-        full = upsample_like(dense.log_depth[0], images[:, 0]).exp()
-        spread = upsample_like(dense.log_spread, images[:, 0]).exp()
-        prediction = DepthPrediction(
+        full = upsample_to(dense.log_depth[0], image_size).exp()
+        # A Laplace distribution deviates by sqrt(2) of its scale.
+        log_std = upsample_to(dense.log_spread, image_size) + 0.5 * math.log(2)
+        return DepthPrediction(
             depth=full,
-            std=2**0.5 * spread * full,
+            std=self.calibration(log_std).exp() * full,
             keypoints=keypoints,
             matches=matches,
             points=points,
             sparse=sparse,
             evidence=Evidence(matched.confidence, matched.posterior, dense),
         )
-        return _with_batch(prediction, batch)
 
 
-def _with_batch(prediction: DepthPrediction, batch: torch.Size) -> DepthPrediction:
-    """Give the flat batch dim of every tensor the caller's leading dims back."""
+def with_batch_dims(prediction: DepthPrediction, batch: torch.Size) -> DepthPrediction:
+    """Give every tensor the caller's leading dims, none or many, for its flat batch dim."""
 
     def restore(value: Any) -> Any:
         if isinstance(value, Tensor):

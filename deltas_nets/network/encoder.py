@@ -5,6 +5,7 @@ uses ReLU6, so that it is fast and quantisable on CPUs. Module names are those o
 Apache-2.0 checkpoint, so that its file loads as it is.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,6 +37,16 @@ class Features(NamedTuple):
     def of_anchor(self) -> "Features":
         """The maps of view 0 alone, ``(B, C, h, w)``."""
         return Features(*(feature[:, 0] for feature in self))
+
+    def each(self) -> list["Features"]:
+        """The views one by one, every one with its dim."""
+        views = range(self.half.shape[1])
+        return [Features(*(feature[:, v : v + 1] for feature in self)) for v in views]
+
+    @staticmethod
+    def joined(views: Sequence["Features"]) -> "Features":
+        """What :meth:`each` took apart."""
+        return Features(*(torch.cat(maps, dim=1) for maps in zip(*views, strict=True)))
 
     def flat(self) -> "Features":
         """Views as batch: ``(B * V, C, h, w)``."""

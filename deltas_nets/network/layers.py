@@ -17,7 +17,12 @@ class ConvBlock(nn.Sequential):
 
 def upsample_like(coarse: Tensor, fine: Tensor) -> Tensor:
     """Resize ``(B, C, h, w)`` bilinearly to the height and width of ``fine``."""
-    return F.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
+    return upsample_to(coarse, (fine.shape[-2], fine.shape[-1]))
+
+
+def upsample_to(coarse: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize ``(B, C, h, w)`` bilinearly to (height, width)."""
+    return F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
 
 
 def zero_initialised(layer: nn.Conv1d | nn.Conv2d) -> nn.Conv1d | nn.Conv2d:

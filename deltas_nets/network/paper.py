@@ -5,6 +5,7 @@ authors need is in :mod:`deltas_nets.reference`.
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,6 +42,20 @@ class ViewTaps(NamedTuple):
     def of_anchor(self) -> Taps:
         """Those of view 0, ``(B, C, h, w)``."""
         return Taps(*(tap[:: self.num_views] for tap in self.taps))
+
+    def each(self) -> list["ViewTaps"]:
+        """The views one by one."""
+        return [
+            self._replace(taps=Taps(*(tap[v :: self.num_views] for tap in self.taps)), num_views=1)
+            for v in range(self.num_views)
+        ]
+
+    @staticmethod
+    def joined(views: Sequence["ViewTaps"]) -> "ViewTaps":
+        """What :meth:`each` took apart."""
+        taps = zip(*(view.taps for view in views), strict=True)
+        together = Taps(*(torch.stack(maps, dim=1).flatten(0, 1) for maps in taps))
+        return views[0]._replace(taps=together, num_views=len(views))
 
 
 class PaperEncoder(nn.Module):

@@ -11,9 +11,10 @@ Example:
 """
 
 from deltas_nets.reference.checkpoint import is_published, load
+from deltas_nets.reference.features import evaluation_input
 from deltas_nets.reference.keypoints import DetectedKeypoints, fill_keypoints, pick_keypoints
 from deltas_nets.reference.metrics import metric_result
-from deltas_nets.reference.network import ReferenceNetwork, evaluation_input
+from deltas_nets.reference.network import ReferenceNetwork
 from deltas_nets.reference.outputs import (
     DensifyOutputs,
     MatchOutputs,

@@ -233,7 +233,8 @@ _HEAD = """\
 
 Where the paper and the network that its authors published disagree, or leave something open, this
 is what each does, and what deltas does. The published network as it is, with all of this, is
-`deltas_nets.reference`; only there do its rules apply.
+`deltas_nets.reference`, which `deltas depth --weights FILE` runs where FILE is the
+[published checkpoint](published_checkpoint.md); only there do its rules apply.
 
 This page is generated: change `deltas_nets/reference/differences.py`, then run
 `python -m deltas_nets.reference.differences > docs/differences.md`.

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom.checks import ShapeError
-from deltas_nets.network.detector import CELL, detector_heatmap
+from deltas_nets.network.detector import CELL
 from deltas_nets.network.resnet import ResNet50
 from deltas_nets.network.sparse_densifier import (
     DecoderMaps,
@@ -19,10 +19,10 @@ from deltas_nets.network.superpoint_head import DescriptorHead, DetectorHead
 from deltas_nets.network.taps import Taps, imagenet_normalised
 from deltas_nets.network.up_projection import insert_zeros
 from deltas_nets.reference.batch import batch_and_views
+from deltas_nets.reference.features import heatmap_of, shown_features
 from deltas_nets.reference.keypoints import DetectedKeypoints, fill_keypoints, pick_keypoints
 from deltas_nets.reference.outputs import (
     DensifyOutputs,
-    FeatureOutputs,
     MatchOutputs,
     ReferenceFeatures,
     ReferenceOutputs,
@@ -34,15 +34,6 @@ from deltas_nets.reference.scores import MatchNorm, correlate_samples, read_matc
 from deltas_nets.reference.segments import reference_segments, segment_samples
 
 Indices = Tensor | Sequence[int]
-
-
-def evaluation_input(images: Tensor) -> Tensor:
-    """RGB in [0, 1] as the original evaluation fed it: in [-1, 1].
-
-    The network normalises by ImageNet's mean and deviation on top of this. Weights that were
-    trained so want their images so.
-    """
-    return (images - 0.5) / 0.5
 
 
 def enlarge_by_rows(x: Tensor, size: tuple[int, int]) -> Tensor:
@@ -76,8 +67,9 @@ class ReferenceNetwork(nn.Module):
 
         Args:
             images: ``((1 + V) * B, 3, H, W)`` RGB at network level, first the B anchors, then
-                their first sources and so on. In [0, 1], or as :func:`evaluation_input` gives
-                them: the network normalises by ImageNet's mean and deviation either way.
+                their first sources and so on. In [0, 1], or as
+                :func:`~deltas_nets.reference.evaluation_input` gives them: the network normalises
+                by ImageNet's mean and deviation either way.
 
         Raises:
             ShapeError: the shape differs, or H or W is no multiple of 8.
@@ -115,7 +107,7 @@ class ReferenceNetwork(nn.Module):
             fraction: at most this share of ``num_points`` is detected.
         """
         return pick_keypoints(
-            _heatmap(logits),
+            heatmap_of(logits),
             num_points=num_points,
             radius=radius,
             threshold=threshold,
@@ -253,7 +245,7 @@ class ReferenceNetwork(nn.Module):
         densified = self.densify(
             features.taps.of_first(1), keypoints, matched.points_3d, matched.in_range
         )
-        return ReferenceOutputs(*_shown(features), *detected, *matched, *densified)
+        return ReferenceOutputs(*shown_features(features), *detected, *matched, *densified)
 
     @torch.no_grad()
     def predict(
@@ -269,7 +261,7 @@ class ReferenceNetwork(nn.Module):
 
         Args:
             images: ``(1 + V, 3, H, W)`` as for :meth:`features`; published weights were trained
-                with what :func:`evaluation_input` gives.
+                with what :func:`~deltas_nets.reference.evaluation_input` gives.
             intrinsics: ``(1, 3, 3)``, the same for all views.
             cam_from_anchor: ``(1, V, 4, 4)`` of the sources, metres.
             num_points: key points in all.
@@ -286,24 +278,3 @@ class ReferenceNetwork(nn.Module):
             features.taps.of_first(1), xy[None], matched.points_3d, matched.in_range
         )
         return ReferencePrediction(densified.dense_depth, xy[None], score[None], matched)
-
-
-def _shown(features: ReferenceFeatures) -> FeatureOutputs:
-    taps, detector, descriptor = features
-    means = Taps(*(tap.mean(dim=1) for tap in taps))
-    return FeatureOutputs(
-        *means,
-        detector.upsampled.mean(dim=1),
-        detector.logits,
-        descriptor.joined_eighth.mean(dim=1),
-        descriptor.joined_fine.mean(dim=1),
-        torch.linalg.vector_norm(descriptor.raw, dim=1),
-        descriptor.unit,
-        _heatmap(detector.logits[0]),
-    )
-
-
-def _heatmap(logits: Tensor) -> Tensor:
-    """Probability of a key point at every pixel, ``(H, W)``."""
-    size = (CELL * logits.shape[-2], CELL * logits.shape[-1])
-    return detector_heatmap(logits[None], image_size=size)[0, 0]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from deltas_nets.errors import UserError
 from deltas_nets.teachers.kornia_detectors import load_aliked, load_disk, load_xfeat
@@ -25,7 +25,7 @@ class Teacher(Protocol):
         ...
 
 
-TEACHERS: dict[str, Callable[[Path], Teacher]] = {
+TEACHERS: dict[str, Callable[[Path], nn.Module]] = {
     "superpoint": load_superpoint,
     "aliked": load_aliked,
     "disk": load_disk,
@@ -42,8 +42,8 @@ LICENCES = {
 """Licences of the published weights, recorded beside what was distilled from them."""
 
 
-def load_teacher(name: str, file: str | Path) -> Teacher:
-    """A teacher with the weights of a file, in evaluation mode.
+def load_teacher(name: str, file: str | Path) -> nn.Module:
+    """A :class:`Teacher` with the weights of a file, in evaluation mode.
 
     Args:
         name: superpoint, aliked, disk or xfeat.

@@ -1,11 +1,9 @@
 """A teacher's weights from the file that its authors published."""
 
-import pickle
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -30,8 +28,9 @@ def read_state(file: Path) -> dict[str, Tensor]:
         raise UserError("no such weights", file, remedy) from None
     except (OSError, EOFError, RuntimeError, ValueError, KeyError) as error:
         raise UserError(f"the weights cannot be read ({error})", file, remedy) from None
-    except (pickle.UnpicklingError, SafetensorError) as error:
-        raise UserError(f"not a file of weights alone ({error})", file, remedy) from None
+    except Exception as error:  # a damaged pickle may raise anything
+        reason = str(error).partition("\n")[0]
+        raise UserError(f"not a file of weights alone ({reason})", file, remedy) from None
     for name in NESTS:
         if isinstance(content, dict) and isinstance(content.get(name), dict):
             content = content[name]

@@ -2,23 +2,33 @@
 
 So a resumed run continues exactly, a step can be looked at without running those before, and
 several processes see together what one would: each takes its part of every step's rooms, and
-what is drawn for a room depends on its place in the step, not on who holds it.
+what is drawn for a room depends on its place in the step, not on who holds it. A tuple of
+ScanNet's frames counts as a room; reading it draws nothing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, Subset, default_collate
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.augment import Photometry, choose_views, disturb_poses, mirror, resize
+from deltas_nets.data.augment import (
+    Photometry,
+    choose_views,
+    disturb_poses,
+    first_views,
+    mirror,
+    resize,
+)
 from deltas_nets.data.posed_images import PosedImages
+from deltas_nets.data.scannet_tuples import ScanNetTuples, open_scannet
 from deltas_nets.data.synthetic import Rooms
+from deltas_nets.errors import UserError
 
 
 class Part(NamedTuple):
@@ -45,6 +55,8 @@ class Batch(NamedTuple):
         true_views: cameras as they were.
         depth: ``(B, V, H, W)`` metres.
         shift: ``(B, 2)`` of the spread keypoints.
+        anchors: ``(B, 3, H, W)`` the anchors in the light they were taken in, for a teacher.
+        labels: ``(B, 65, ceil(H/8), ceil(W/8))`` of a teacher, once it has looked.
     """
 
     images: Tensor
@@ -52,6 +64,8 @@ class Batch(NamedTuple):
     true_views: PosedViews
     depth: Tensor
     shift: Tensor
+    anchors: Tensor
+    labels: Tensor | None = None
 
     def split(self, count: int) -> list["Batch"]:
         """Equal, consecutive parts; B is a multiple of ``count``."""
@@ -65,6 +79,8 @@ class Batch(NamedTuple):
             PosedViews(*(tensor[rooms] for tensor in self.true_views)),
             self.depth[rooms],
             self.shift[rooms],
+            self.anchors[rooms],
+            None if self.labels is None else self.labels[rooms],
         )
 
 
@@ -104,26 +120,114 @@ class StepSampler(Sampler[list[int]]):
             yield batch
 
 
-def room_loader(
-    config: TrainConfig, *, start: int, stop: int, part: Part = ALL
-) -> DataLoader[PosedImages]:
-    """Rooms of the steps ``start .. stop``, read or rendered ahead."""
+def training_data(
+    config: TrainConfig, *, report: Callable[[str], None] = lambda _: None
+) -> Rooms | ScanNetTuples:
+    """What the config wants to train on.
+
+    Args:
+        config: of the run.
+        report: gets lines about what there is.
+
+    Raises:
+        UserError: there is none of it.
+    """
     data = config.data
-    rooms = Rooms(
+    if data.source == "scannet":
+        return _frames(config, data.scannet.split, "--data.split", report)
+    return Rooms(
         data.num_rooms,
         seed=data.seed,
         num_views=data.num_views,
         image_size=(data.height, data.width),
         cache_dir=None if data.cache is None else Path(data.cache),
     )
-    sampler = StepSampler(
-        len(rooms), config.batch_size, seed=config.seed, start=start, stop=stop, part=part
+
+
+def validation_data(
+    config: TrainConfig, *, report: Callable[[str], None] = lambda _: None
+) -> Subset[PosedImages] | None:
+    """Tuples of the validation split, spread evenly over it; None if the config names none.
+
+    Raises:
+        UserError: there is none.
+    """
+    scannet = config.data.scannet
+    if scannet.validation is None:
+        return None
+    frames = _frames(config, scannet.validation, "--data.validation", report)
+    count = min(scannet.validation_tuples, len(frames))
+    return Subset(frames, [len(frames) * number // count for number in range(count)])
+
+
+def _frames(
+    config: TrainConfig, split: str, option: str, report: Callable[[str], None]
+) -> ScanNetTuples:
+    data = config.data
+    return open_scannet(
+        data.scannet,
+        split,
+        num_views=config.max_views,
+        image_size=(data.height, data.width),
+        cache=None if data.cache is None else Path(data.cache),
+        option=option,
+        report=report,
     )
-    return DataLoader(rooms, batch_sampler=sampler, num_workers=data.workers)
+
+
+def step_loader(
+    data: Rooms | ScanNetTuples, config: TrainConfig, *, start: int, stop: int, part: Part = ALL
+) -> Iterator[PosedImages]:
+    """Rooms of the steps ``start .. stop``, read or rendered ahead by workers.
+
+    Raises:
+        UserError: one of them cannot be read.
+    """
+    sampler = StepSampler(
+        len(data), config.batch_size, seed=config.seed, start=start, stop=stop, part=part
+    )
+    loader: DataLoader[PosedImages | UserError] = DataLoader(
+        _OrError(data),
+        batch_sampler=sampler,
+        num_workers=config.data.workers,
+        collate_fn=_collate,
+    )
+    for rooms in loader:
+        if isinstance(rooms, UserError):
+            raise rooms
+        yield rooms
+
+
+def room_loader(
+    config: TrainConfig, *, start: int, stop: int, part: Part = ALL
+) -> Iterator[PosedImages]:
+    """:func:`step_loader` of the config's own data."""
+    return step_loader(training_data(config), config, start=start, stop=stop, part=part)
+
+
+class _OrError(Dataset[PosedImages | UserError]):
+    """Errors as items: of one that a worker raises nothing but its traceback comes through."""
+
+    def __init__(self, data: Rooms | ScanNetTuples) -> None:
+        self.data = data
+
+    def __getitem__(self, index: int) -> PosedImages | UserError:
+        try:
+            return self.data[index]
+        except UserError as error:
+            return error
+
+
+def _collate(items: list[PosedImages | UserError]) -> PosedImages | UserError:
+    for item in items:
+        if isinstance(item, UserError):
+            return item
+    batch: PosedImages = default_collate(items)
+    return batch
 
 
 class BatchMaker:
-    """Rooms as rendered to :class:`Batch`.
+    """Rooms as rendered, or tuples as read, to :class:`Batch`.
 
     Args:
         config: of the run.
@@ -154,12 +258,16 @@ class BatchMaker:
             ),
             depth=torch.cat([room.depth for room in made]),
             shift=torch.cat([room.shift for room in made]),
+            anchors=torch.cat([room.anchors for room in made]),
         )
 
     def _room(self, room: PosedImages, num_views: int, size: tuple[int, int], seed: int) -> Batch:
         """A batch of one."""
         random = torch.Generator().manual_seed(seed)
-        room = choose_views(room, num_views, random)
+        if self.config.data.source == "rooms":
+            room = choose_views(room, num_views, random)
+        else:
+            room = first_views(room, num_views)
         room = room._replace(images=room.images.float() / 255)
         room = mirror(resize(room, size), torch.rand(1, generator=random) < 0.5)
         return Batch(
@@ -168,6 +276,7 @@ class BatchMaker:
             true_views=room.views,
             depth=room.depth,
             shift=torch.rand(1, 2, generator=random),
+            anchors=room.images[:, 0],
         )
 
 

@@ -5,18 +5,17 @@ speaks of weights that are not there, and a run goes on from the last one that w
 """
 
 import json
-import os
-from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from deltas_nets.atomic_files import TEMPORARY, write_atomically, write_json
-from deltas_nets.config import TrainConfig, from_dict, to_dict
+from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.pretrained import save_weights
+from deltas_nets.teachers import LICENCES
 from deltas_nets.train.average import RunningAverage
 
 CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetensors"
@@ -43,15 +42,21 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str)
     write_json(folder / CONFIG, to_dict(config))
     average = state.average.model
     assert isinstance(average, Deltas)
+    public = without_paths(config)
+    data, licence = _data_and_licence(public)
     metadata = {
         "step": str(state.step),
         "seed": str(config.seed),
-        "data": f"procedural rooms {config.data.seed}..{config.data.seed + config.data.num_rooms}",
+        "data": data,
         "origin": origin,
-        "licence": "Apache-2.0",
-        # Where rooms are kept is the machine's, and changes nothing.
-        "train": json.dumps(to_dict(replace(config, data=replace(config.data, cache=None)))),
+        "licence": licence,
+        "train": json.dumps(to_dict(public)),
     }
+    if config.teacher is not None:
+        metadata |= {
+            "detector_teacher": config.teacher,
+            "detector_teacher_licence": LICENCES[config.teacher],
+        }
     save_weights(folder / WEIGHTS, average, metadata)
     content = {
         "step": state.step,
@@ -60,14 +65,16 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str)
         "average": average.state_dict(),
         "optimizer": state.optimizer.state_dict(),
     }
-    write_atomically(folder / CHECKPOINT, lambda file: _save_durably(content, file))
+    write_atomically(folder / CHECKPOINT, lambda file: torch.save(content, file))
 
 
-def _save_durably(content: dict[str, Any], file: IO[bytes]) -> None:
-    torch.save(content, file)
-    file.flush()
-    # Without it a power cut can leave the new name on an empty file.
-    os.fsync(file.fileno())
+def _data_and_licence(config: TrainConfig) -> tuple[str, str]:
+    """What weights were trained on, and what that leaves of our licence."""
+    data = config.data
+    if data.source == "rooms":
+        return f"procedural rooms {data.seed}..{data.seed + data.num_rooms}", "Apache-2.0"
+    terms = "trained on ScanNet, whose terms of use apply"
+    return f"ScanNet, scenes of {data.scannet.split}", terms
 
 
 def remove_half_written(folder: Path) -> None:

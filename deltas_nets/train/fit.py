@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import nn
+from torch.utils.data import Subset
 
 from deltas_nets.config import TrainConfig
+from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.rooms import evaluate_rooms
-from deltas_nets.train.batches import BatchMaker, room_loader
+from deltas_nets.train.batches import BatchMaker, step_loader, training_data, validation_data
 from deltas_nets.train.checkpoint import WEIGHTS, remove_half_written, save_run
 from deltas_nets.train.log import FolderLog, RunLog
 from deltas_nets.train.optimiser import set_learning_rate
@@ -50,7 +52,7 @@ def fit(
             log.jsonl and TensorBoard's event files. All machines see it.
         start: what to start from.
         checkpoint_every: steps between checkpoints.
-        validate_every: steps between evaluations on held-out rooms.
+        validate_every: steps between evaluations on held-out rooms or scenes.
         log_every: steps between entries in the log.
         stop: end after this step, to be resumed later; the schedule stays that of the config.
         report: where messages go.
@@ -59,18 +61,20 @@ def fit(
         The weights file.
 
     Raises:
-        UserError: a file to start from is missing or does not fit, or training diverged; in
-            all processes.
+        UserError: a file to start from is missing or does not fit, there is nothing to train on,
+            or training diverged; in all processes.
         KeyboardInterrupt: Ctrl-C or SIGTERM, after the step was finished and saved.
     """
     fabric = launch_fabric(config)
-    state, origin = starting_state(config, folder, start, fabric)
+    tell = report if fabric.is_global_zero else _silently
+    data, held_out = training_data(config, report=tell), validation_data(config, report=tell)
+    state, origin, teacher = starting_state(config, folder, start, fabric)
     objective = Objective(state.model, config)
     wrapped, optimizer = fabric.setup(objective, state.optimizer)
-    stepper = Stepper(objective, wrapped, optimizer, fabric)
+    stepper = Stepper(objective, wrapped, optimizer, fabric, teacher)
     maker = BatchMaker(config, part_of(fabric))
     step, last = state.step, min(config.steps, stop or config.steps)
-    loader = room_loader(config, start=step, stop=last, part=part_of(fabric))
+    loader = step_loader(data, config, start=step, stop=last, part=part_of(fabric))
     saved = step if start.resume else -1
 
     def save() -> None:
@@ -106,12 +110,16 @@ def fit(
                 fabric.barrier()  # torchrun ends the others when one is gone
                 raise KeyboardInterrupt
             if (step % validate_every == 0 or step == last) and fabric.is_global_zero:
-                log.validation(step, validate(state.average.model))
+                log.validation(step, metrics_of(state.average.model, held_out))
             # After the validation: a run whose last checkpoint is written lacks nothing.
             if step % checkpoint_every == 0 or step == last:
                 save()
     fabric.barrier()
     return folder / WEIGHTS
+
+
+def _silently(message: str) -> None:
+    """For processes that are not the first."""
 
 
 def _log(
@@ -124,6 +132,13 @@ def _log(
     if not fabric.is_global_zero:
         return RunLog()
     return FolderLog(folder, config, step=step, report=report)
+
+
+def metrics_of(model: nn.Module, held_out: Subset[PosedImages] | None) -> dict[str, float]:
+    """Depth metrics on held-out tuples, on rooms if there are none."""
+    if held_out is None:
+        return validate(model)
+    return evaluate_rooms(model, held_out, depth_range=DEPTH_RANGE)
 
 
 def validate(model: nn.Module) -> dict[str, float]:

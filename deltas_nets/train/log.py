@@ -60,6 +60,7 @@ class FolderLog(RunLog):
         file = folder / LOG
         drop_later_entries(file, step)
         self.report = report
+        self._held_out = "rooms" if config.data.scannet.validation is None else "scenes"
         self._file = file.open("a", encoding="utf-8")
         self._curves = _curves(folder / CURVES, step)
         if self._curves is not None:
@@ -106,7 +107,7 @@ class FolderLog(RunLog):
         """A line, a point on every curve, and a message."""
         self._write({"step": step, "validation": metrics})
         self._draw("validation", metrics, step)
-        self.report(f"step {step}: held-out rooms {_in_words(metrics)}")
+        self.report(f"step {step}: held-out {self._held_out} {_in_words(metrics)}")
 
     def _write(self, entry: Mapping[str, object]) -> None:
         print(json.dumps(plain(entry)), file=self._file, flush=True)

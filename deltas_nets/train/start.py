@@ -5,15 +5,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+from torch import nn
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.pretrained import load_weights, read_metadata
+from deltas_nets.teachers import load_teacher
+from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batch_norm import prepare_batch_norm
 from deltas_nets.train.checkpoint import RunState, load_run
 from deltas_nets.train.optimiser import make_optimizer
+from deltas_nets.train.resume import check_continues
 from deltas_nets.train.step import unreached
 
 if TYPE_CHECKING:
@@ -29,12 +33,15 @@ class Start:
         init: a weights file for the whole network.
         step: the first step, for a schedule that goes on from ``init``.
         resume: go on from the checkpoint in the run's folder.
+        teacher: weights of the teacher that the config names. They are in no checkpoint: to go on
+            it is given again.
     """
 
     encoder: Path | None = None
     init: Path | None = None
     step: int = 0
     resume: bool = False
+    teacher: Path | None = None
 
 
 class Started(NamedTuple):
@@ -43,18 +50,24 @@ class Started(NamedTuple):
     Attributes:
         state: on this process's device.
         origin: what the weights started from, with its licence.
+        teacher: of the detector, on this process's device; None where the config names none.
     """
 
     state: RunState
     origin: str
+    teacher: TeacherLabels | None
 
 
 def starting_state(config: TrainConfig, folder: Path, start: Start, fabric: "Fabric") -> Started:
     """Network, average and optimizer, the same in every process.
 
     Raises:
-        UserError: a file to start from is missing or does not fit.
+        UserError: a file to start from is missing or does not fit, or the run to go on with has
+            another config.
     """
+    if start.resume:
+        check_continues(folder, config)
+    teacher = _teacher(config, start)  # first: nothing has been computed yet
     torch.manual_seed(config.seed)
     model = Deltas(config.network)
     origin = "random weights"
@@ -66,6 +79,7 @@ def starting_state(config: TrainConfig, folder: Path, start: Start, fabric: "Fab
             raise UserError("no such weights", start.init, "name a .safetensors file with --init")
         origin = read_metadata(start.init).get("origin", "unknown weights")
         load_weights(model, start.init)
+        model.calibration.reset()  # it was fitted to what is about to change
     if fabric.world_size > 1:
         parameters = dict(model.named_parameters())
         for name in unreached(model, config):
@@ -78,4 +92,23 @@ def starting_state(config: TrainConfig, folder: Path, start: Start, fabric: "Fab
     if start.resume:
         state, origin = load_run(folder, state)
     prepare_batch_norm(model, config, processes=fabric.world_size)
-    return Started(state, origin)
+    if teacher is None:
+        return Started(state, origin, None)
+    return Started(state, origin, TeacherLabels(fabric.to_device(teacher)))
+
+
+def _teacher(config: TrainConfig, start: Start) -> nn.Module | None:
+    """The teacher that the config names.
+
+    Raises:
+        UserError: there is no such teacher, or its weights are missing or another's.
+    """
+    if config.teacher is None and start.teacher is not None:
+        raise UserError("whose weights are these?", "--teacher-weights", "add --teacher NAME")
+    if config.teacher is None:
+        return None
+    if start.teacher is None:
+        raise UserError(
+            f"no weights for {config.teacher}", "--teacher", "add --teacher-weights FILE"
+        )
+    return load_teacher(config.teacher, start.teacher)

@@ -13,6 +13,7 @@ from deltas_nets.config import TrainConfig
 from deltas_nets.counts import WHOLE, Counts, CountsOverProcesses, CountsToCome, KnownCounts
 from deltas_nets.losses import Losses, training_losses
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.batch_norm import Statistics
 from deltas_nets.train.batches import Batch
 
@@ -54,6 +55,7 @@ class Objective(nn.Module):
             batch.depth,
             self.config.loss,
             depth_range=DEPTH_RANGE,
+            labels=batch.labels,
             counts=counts,
         )
 
@@ -80,6 +82,7 @@ class Stepper:
         wrapped: the same, set up by Fabric.
         optimizer: set up by Fabric.
         fabric: launched.
+        teacher: says what the detector is to find, on the same device.
     """
 
     def __init__(
@@ -88,11 +91,13 @@ class Stepper:
         wrapped: nn.Module,
         optimizer: torch.optim.Optimizer,
         fabric: "Fabric",
+        teacher: TeacherLabels | None = None,
     ) -> None:
         self.objective = objective
         self.wrapped = wrapped
         self.optimizer = optimizer
         self.fabric = fabric
+        self.teacher = teacher
         self.config = objective.config
 
     def __call__(self, batch: Batch, *, stop: bool = False) -> StepResult:
@@ -104,7 +109,8 @@ class Stepper:
             batch: on the device.
             stop: this process was asked to stop.
         """
-        fabric, passes = self.fabric, batch.split(self.config.accumulate)
+        fabric = self.fabric
+        passes = [self._taught(part) for part in batch.split(self.config.accumulate)]
         counts_of_a_pass, statistics = self._counts(passes), Statistics(self.objective)
         self.optimizer.zero_grad()
         totals = torch.zeros(len(Losses._fields), device=batch.images.device)
@@ -133,6 +139,11 @@ class Stepper:
         return StepResult(
             dict(zip(Losses._fields, means, strict=True)), done=not skip, stop=stopping > 0
         )
+
+    def _taught(self, batch: Batch) -> Batch:
+        if self.teacher is None:
+            return batch
+        return batch._replace(labels=self.teacher(batch.anchors))
 
     def _counts(self, passes: list[Batch]) -> Callable[[], Counts]:
         if len(passes) > 1:
@@ -177,7 +188,7 @@ def unreached(model: Deltas, config: TrainConfig) -> list[str]:
     cam_from_world[:, 1, 0, 3] = -0.2
     views = PosedViews(K.repeat(2, 2, 1, 1), cam_from_world)
     depth = torch.full((2, 2, height, width), 2.0)
-    batch = Batch(images, views, views, depth, torch.zeros(2, 2))
+    batch = Batch(images, views, views, depth, torch.zeros(2, 2), images[:, 0])
     Objective(trial, config)(batch).total.backward()
     return [
         name

@@ -170,6 +170,25 @@ def test_what_is_masked_may_lie_anywhere(
             assert_close(found, wanted, rtol=0, atol=0)
 
 
+@BOTH
+def test_a_mask_may_lack_dims_and_hides_what_is_no_number(
+    function: Correlation, dtype: torch.dtype
+) -> None:
+    descriptors, features, pixels = random_scene(dtype)
+    every = function(descriptors, features, samples_at(pixels), image_size=SIZE)
+    generator = torch.Generator().manual_seed(1)
+    for shape in ((), (2,), (3, 1, 1), (2, 1, 1, 2), (4, 1, 3, 1, 2)):
+        mask = torch.rand(shape, generator=generator) < 0.5
+        samples = samples_at(pixels, mask)
+        found = function(descriptors, features, samples, image_size=SIZE)
+        assert_close(found, torch.where(mask, every, 0.0))
+        for value in (torch.nan, torch.inf):
+            unknown = torch.full_like(features, value)
+            assert (function(descriptors, unknown, samples, image_size=SIZE) == 0)[
+                ~mask.expand_as(found)
+            ].all()
+
+
 @pytest.mark.parametrize("normalized", [False, True])
 def test_gradients_are_those_of_sampling_all_channels(dtype: torch.dtype, normalized: bool) -> None:
     leaves = [part.requires_grad_() for part in random_scene(dtype, count=300, size=(6, 8))]
@@ -261,8 +280,17 @@ def test_vmap_and_jacrev_agree_with_plain_calls(function: Correlation) -> None:
     assert_close(found[0, ..., 0, :, :, :], wanted[2], rtol=0, atol=1e-10)
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler")
-def test_both_compile_without_a_graph_break() -> None:
+NEEDS_COMPILER = pytest.mark.skipif(
+    shutil.which("g++") is None, reason="torch.compile needs a C++ compiler"
+)
+
+
+# What torch.compile does before a compiler sees the graph is what may break.
+@pytest.mark.parametrize(
+    "backend",
+    ["aot_eager", pytest.param("inductor", marks=[pytest.mark.slow, NEEDS_COMPILER])],
+)
+def test_both_compile_without_a_graph_break(backend: str) -> None:
     *leaves, pixels = random_scene()
     leaves = [leaf.requires_grad_() for leaf in leaves]
 
@@ -273,7 +301,8 @@ def test_both_compile_without_a_graph_break() -> None:
         )
         return sum(scores.square().sum() for scores in pair)
 
-    found = torch.autograd.grad(torch.compile(score, fullgraph=True)(*leaves), leaves)
+    compiled = torch.compile(score, fullgraph=True, backend=backend)
+    found = torch.autograd.grad(compiled(*leaves), leaves)
     for ours, wanted in zip(found, torch.autograd.grad(score(*leaves), leaves), strict=True):
         assert_close(ours, wanted, rtol=1e-9, atol=1e-9)
 

@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.normal_matrix import Symmetric3, inverse3, normal_matrix, solve3
+from deltas_geom.normal_matrix import (
+    Symmetric3,
+    alike_coefficients,
+    alike_normal_matrix,
+    inverse3,
+    normal_matrix,
+    solve3,
+)
 from deltas_geom.testing.strategies import extreme, scales, vectors
 from deltas_geom.uncertainty import unpacked3
 
@@ -63,6 +70,15 @@ def test_squared_weights_multiply_it(drawn: tuple[Tensor, ...], factor: float) -
     *known, squared = drawn
     found = torch.stack(normal_matrix(*known, factor * squared))
     assert_close(found / factor, torch.stack(normal_matrix(*known, squared)), rtol=0, atol=1e-12)
+
+
+@given(drawn=seen())
+def test_it_may_be_prepared_where_all_points_weigh_the_same(drawn: tuple[Tensor, ...]) -> None:
+    proj, x, y, squared = drawn
+    wanted = torch.stack(normal_matrix(proj, x, y, squared[:, :1]))
+    coefficients = alike_coefficients(proj, squared[:, :1])
+    found = torch.stack(alike_normal_matrix(coefficients, torch.stack([x, y], dim=-2)))
+    assert_close(found, wanted, rtol=0, atol=1e-12)
 
 
 @given(matrix=definite(decades=100), x=vectors(1, within=2.0))

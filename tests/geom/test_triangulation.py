@@ -453,3 +453,24 @@ def test_many_points_are_solved_as_few_are() -> None:
         assert whole.covariance is not None
         assert part.covariance is not None
         assert_close(whole.covariance[some], part.covariance, rtol=1e-6, atol=1e-12)
+
+
+@given(drawn=noisy())
+def test_no_weights_are_equal_weights(drawn: tuple[PosedScene, Tensor]) -> None:
+    scene, weights = drawn
+    alone = triangulate_points(scene.views.proj, scene.pixels)
+    found = triangulate_points(scene.views.proj, scene.pixels, torch.full_like(weights, 0.3))
+    assert_close(found, alone, rtol=0, atol=1e-9)
+
+
+@given(drawn=noisy())
+def test_a_bad_point_leaves_the_others_alone(drawn: tuple[PosedScene, Tensor]) -> None:
+    scene, weights = drawn
+    proj, pixels = scene.views.proj.float(), scene.pixels.float()
+    spoiled = pixels.clone()
+    spoiled[1, 0, 0] = torch.nan
+    for weighed in (None, weights.float()):
+        found = triangulate(proj, spoiled, weighed)
+        assert found.status[0] == Status.NOT_FINITE_INPUT.value
+        wanted = triangulate_points(proj, pixels, weighed)
+        assert_close(found.points[1:], wanted[1:], rtol=0, atol=1e-5)

@@ -9,6 +9,7 @@ half=STEP   stops for a minute when half of the checkpoint after STEP is written
             a file named "writing" in the folder
 poison=RANK that process sees NaN in step 1 and from step 3 on, counted from 0
 stop=RANK   that process gets SIGTERM in step 1
+teacher=FILE   weights of the config's teacher
 """
 
 import io
@@ -85,14 +86,22 @@ def launch(
     )
 
 
-def train(folder: Path, config: TrainConfig, start: Start) -> None:
+def train(folder: Path, config: TrainConfig, start: Start, *, stop: int | None = None) -> None:
     """Train in this process; validation looks at one small room."""
     rooms, threads = fit_module.validation_rooms, torch.get_num_threads()
     few = Rooms(1, num_views=2, image_size=(48, 64))
     fit_module.validation_rooms = lambda: few
     torch.set_num_threads(1)  # as in every other process, to the last bit
     try:
-        fit(config, folder, start, checkpoint_every=3, log_every=1, report=lambda message: None)
+        fit(
+            config,
+            folder,
+            start,
+            checkpoint_every=3,
+            log_every=1,
+            stop=stop,
+            report=lambda message: None,
+        )
     finally:
         fit_module.validation_rooms = rooms
         torch.set_num_threads(threads)
@@ -216,7 +225,9 @@ def main() -> None:
     if options.get("stop") == rank:
         get_told_to_stop()
     with double_precision() if "double" in options else nullcontext():
-        train(folder, from_dict(TrainConfig, config), Start(resume="resume" in options))
+        teacher = Path(options["teacher"]) if "teacher" in options else None
+        start = Start(resume="resume" in options, teacher=teacher)
+        train(folder, from_dict(TrainConfig, config), start)
 
 
 if __name__ == "__main__":

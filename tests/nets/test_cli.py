@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from run_command import Run, assert_one_line, runner
 
 from deltas_nets import cli
 from deltas_nets.cli_training import Train
@@ -19,31 +20,12 @@ from deltas_nets.outputs import read_depth_png, read_points_ply
 from deltas_nets.pretrained import save_weights
 
 MakeCapture = Callable[..., Path]
-Run = Callable[..., "Result"]
-
-
-class Result:
-    """What a command left behind."""
-
-    def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
 
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
     """Run `deltas` with arguments, in this process."""
-
-    def run(*arguments: object) -> Result:
-        monkeypatch.setattr(sys, "argv", ["deltas", *map(str, arguments)])
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as stopped:
-            code = int(stopped.code or 0)
-        captured = capfd.readouterr()
-        return Result(code, captured.out, captured.err)
-
-    return run
+    return runner(monkeypatch, capfd)
 
 
 @pytest.fixture(scope="session")
@@ -55,14 +37,6 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("weights") / "small.safetensors"
     save_weights(file, Deltas(config), {"step": "0"})
     return file
-
-
-def assert_one_line(result: Result, *parts: str) -> None:
-    assert result.code == 2
-    assert result.err.startswith("deltas: ")
-    assert result.err.count("\n") == 1
-    for part in parts:
-        assert part in result.err, result.err
 
 
 def test_depth_fills_the_folder_as_promised(
@@ -368,7 +342,7 @@ def test_train_resume_and_refusal(run: Run, tmp_path: Path) -> None:
     weights = out / "weights.safetensors"
     late = ["--init", weights, "--start-step", 9, "--steps", 5]
     assert_one_line(run(*fresh, *late), "--start-step", "ends at 5")
-    assert_one_line(run("train", "--out", out, "--resume", "--steps", 9), "keeps its config")
+    assert_one_line(run("train", "--out", out, "--resume", "--steps", 9), "steps 2, not 9")
     assert_one_line(run("depth", "x", "--out", "y", "--weights", out / "checkpoint.pt"), "x")
     assert not (tmp_path / "x").exists()
 

@@ -11,6 +11,16 @@ from deltas_nets.config import (
     TrainConfig,
     from_dict,
     to_dict,
+    without_paths,
+)
+from deltas_nets.data.scannet_config import ScanNetConfig
+
+FRAMES = DataConfig(
+    source="scannet",
+    cache="/mine/kept",
+    scannet=ScanNetConfig(
+        root="/mine", split="/mine/a.txt", validation="/mine/b.txt", skip="c.txt", baseline=(0.1, 1)
+    ),
 )
 
 
@@ -20,6 +30,7 @@ from deltas_nets.config import (
         NetworkConfig(),
         NetworkConfig(name="other", matcher=MatcherConfig(kind="per_view", offsets=(-2.0, 2.0))),
         TrainConfig(steps=7, sizes=((48, 64),), data=DataConfig(cache="somewhere")),
+        TrainConfig(data=FRAMES),
     ],
 )
 def test_a_config_survives_json(config: NetworkConfig | TrainConfig) -> None:
@@ -36,3 +47,20 @@ def test_nonsense_is_refused_in_the_users_words() -> None:
         TrainConfig(min_views=4, max_views=3)
     with pytest.raises(ValueError, match="num_samples must be at least 8"):
         MatcherConfig(num_samples=2)
+    with pytest.raises(ValueError, match="need --data scannet"):
+        DataConfig(scannet=ScanNetConfig(root="somewhere"))
+    with pytest.raises(ValueError, match="gap must be at least 1"):
+        ScanNetConfig(gap=0)
+    TrainConfig(data=FRAMES, max_views=7)  # of rooms, 5 views are rendered
+
+
+def test_what_is_shown_to_others_has_names_but_no_folders() -> None:
+    config = TrainConfig(steps=7, data=FRAMES)
+    public = without_paths(config)
+    assert "/" not in json.dumps(to_dict(public))
+    scannet = public.data.scannet
+    assert (scannet.root, scannet.split, scannet.validation) == (None, "a.txt", "b.txt")
+    assert scannet.skip == "c.txt" and scannet.baseline == (0.1, 1)
+    assert public.steps == 7 and public.data.source == "scannet" and public.data.cache is None
+    assert without_paths(public) == public
+    assert without_paths(TrainConfig()) == TrainConfig()

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from published_tables import Tables, random_tables
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -16,42 +17,6 @@ from deltas_nets.pretrained import weights_file
 from deltas_nets.reference import ReferenceNetwork
 from deltas_nets.reference.checkpoint import ENTRIES
 from deltas_nets.reference.differences import DIFFERENCES, page
-
-Tables = dict[str, dict[str, Tensor]]
-
-
-def random_tables() -> Tables:
-    """Weights of the published shapes, all of them views of one small storage: small files."""
-    generator = torch.Generator().manual_seed(0)
-    numbers = 0.03 * torch.randn(80000, generator=generator)
-    with torch.device("meta"):
-        network = ReferenceNetwork()
-
-    def table(*parts: torch.nn.Module) -> dict[str, Tensor]:
-        return {
-            key: weight(key, value.shape)
-            for part in parts
-            for key, value in part.state_dict().items()
-        }
-
-    def weight(key: str, shape: torch.Size) -> Tensor:
-        if key.endswith("num_batches_tracked"):
-            return torch.tensor(7)
-        if key.endswith(("running_var", "weight")) and len(shape) == 1:
-            return numbers.new_ones(1).expand(shape)
-        if shape.numel() <= len(numbers):
-            return numbers[: shape.numel()].view(shape)
-        row = shape[1:]  # all output channels alike
-        return numbers[: row.numel()].view(row).expand(shape)
-
-    tables = (
-        table(network.encoder, network.detector_head, network.descriptor_head),
-        table(network.match_norm),
-        table(network.densifier.encoder, network.densifier.decoder),
-    )
-    unused = {"convD_confa.weight": numbers[:9].view(1, 1, 3, 3), "bnconvD_confa.bias": numbers[:1]}
-    tables[1].update(unused)
-    return dict(zip(ENTRIES, tables, strict=True))
 
 
 @pytest.fixture(scope="module")

@@ -256,7 +256,7 @@ def test_weights_alone_continue_the_schedule(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_started_from_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no checkpoint to resume"):
+    with pytest.raises(UserError, match="nothing to resume"):
         fit(CONFIG, tmp_path / "empty", Start(resume=True))
     with pytest.raises(UserError, match="no such weights"):
         fit(CONFIG, tmp_path / "empty", Start(init=tmp_path / "none.safetensors"))

@@ -1,17 +1,28 @@
 """ScanNet's export layout: color/N.jpg, depth/N.png, pose/N.txt, intrinsic/*.txt."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from deltas_nets.data.capture import Capture, FloatArray, Frame, ids_in_words, image_size_of
 from deltas_nets.errors import UserError
 
-__all__ = ["read", "recognises", "world_from_cam_inverse"]
+__all__ = [
+    "NESTING",
+    "SceneFiles",
+    "find_files",
+    "is_scene",
+    "read",
+    "read_pose",
+    "recognises",
+    "world_from_cam_inverse",
+]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
+"""Folders that scenes may lie in, inside of the one that is named."""
 
 RIGID_TOLERANCE = 2e-3
 """Largest entry of R^T R - I. Six digits after the point give 1e-5, 7-Scenes as published
@@ -25,34 +36,36 @@ because a refusal has no way around it. Images resized by 0.76 or 1.43 are found
 _NO_POSE = "repair it or take the frame out of the view sets"
 
 
+class SceneFiles(NamedTuple):
+    """What the folder of one scene holds; poses are not read yet.
+
+    Attributes:
+        images: colour images by frame number, in order.
+        poses: pose files by frame number.
+        depths: depth images by frame number; empty where there is no such folder.
+        image_size: (height, width) of the colour images.
+        K: ``(3, 3)`` of the colour images.
+        depth_K: ``(3, 3)`` of the depth images; None where they see what the images see.
+    """
+
+    images: Mapping[int, Path]
+    poses: Mapping[int, Path]
+    depths: Mapping[int, Path]
+    image_size: tuple[int, int]
+    K: FloatArray
+    depth_K: FloatArray | None
+
+
 def recognises(path: Path) -> bool:
     """Whether this folder, or a folder of scenes inside it, is laid out this way."""
     nested = any((path / name).is_dir() for name in NESTING)
-    return nested or _is_scene(path) or any(map(_is_scene, path.iterdir()))
+    return nested or is_scene(path) or any(map(is_scene, path.iterdir()))
 
 
 def read(path: Path) -> Capture:
     """Read one scene; see `deltas_nets.data.capture.open_capture` for the contract."""
     scene = _find_scene(path)
-    images = _files_by_id(scene / "color", IMAGE_SUFFIXES)
-    poses = _files_by_id(scene / "pose", (".txt",))
-    depths = _files_by_id(scene / "depth", (".png",)) if (scene / "depth").is_dir() else {}
-    if not images:
-        remedy = "put the images there, named by number: 0.jpg, 1.jpg, ..."
-        raise UserError("there are no numbered images", scene / "color", remedy)
-    if not images.keys() & poses.keys():
-        what = f"no pose belongs to an image ({len(poses)} poses, {len(images)} images)"
-        remedy = "name each pose file like its image: pose/7.txt for color/7.jpg"
-        raise UserError(what, scene / "pose", remedy)
-
-    image_size = _common_size(list(images.values()))
-    K = _read_intrinsics(scene / "intrinsic" / "intrinsic_color.txt", image_size)
-    depth_K = None
-    depth_intrinsics = scene / "intrinsic" / "intrinsic_depth.txt"
-    # Registered depth often comes without a file of its own: None says "as the colour image".
-    if depths and depth_intrinsics.exists():
-        depth_K = _read_intrinsics(depth_intrinsics, _common_size(list(depths.values())))
-
+    images, poses, depths, image_size, K, depth_K = find_files(scene)
     frames: dict[int, Frame] = {}
     lost: dict[int, UserError] = {}
     for id, image_path in images.items():
@@ -60,7 +73,7 @@ def read(path: Path) -> Capture:
             file = scene / "pose" / f"{id}.txt"
             lost[id] = UserError(f"frame {id} has no pose file", file, _NO_POSE)
             continue
-        world_from_cam = _read_pose(poses[id])
+        world_from_cam = read_pose(poses[id])
         if not np.isfinite(world_from_cam).all():
             lost[id] = UserError(f"the pose of frame {id} is not finite", poses[id], _NO_POSE)
             continue
@@ -79,6 +92,44 @@ def read(path: Path) -> Capture:
         what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(lost)})"
         raise UserError(what, scene / "pose", "run the tracking again")
     return Capture(path=scene, frames=frames, lost=lost)
+
+
+def find_files(scene: Path) -> SceneFiles:
+    """The files of a scene by frame number, and its intrinsics.
+
+    Args:
+        scene: the folder that holds color, pose and intrinsic.
+
+    Raises:
+        UserError: a folder or the images are missing, no pose belongs to an image, or the
+            intrinsics are missing or do not fit the images.
+    """
+    remedies = {
+        "color": "put the images there: color/0.jpg, color/1.jpg, ...",
+        "pose": "put a 4x4 camera-to-world matrix there for each image: pose/0.txt, ...",
+    }
+    for name, remedy in remedies.items():
+        if not (scene / name).is_dir():
+            raise UserError(f"the capture has no folder {name}", scene, remedy)
+    images = _files_by_id(scene / "color", IMAGE_SUFFIXES)
+    poses = _files_by_id(scene / "pose", (".txt",))
+    depths = _files_by_id(scene / "depth", (".png",)) if (scene / "depth").is_dir() else {}
+    if not images:
+        remedy = "put the images there, named by number: 0.jpg, 1.jpg, ..."
+        raise UserError("there are no numbered images", scene / "color", remedy)
+    if not images.keys() & poses.keys():
+        what = f"no pose belongs to an image ({len(poses)} poses, {len(images)} images)"
+        remedy = "name each pose file like its image: pose/7.txt for color/7.jpg"
+        raise UserError(what, scene / "pose", remedy)
+
+    image_size = _common_size(list(images.values()))
+    K = _read_intrinsics(scene / "intrinsic" / "intrinsic_color.txt", image_size)
+    depth_K = None
+    depth_intrinsics = scene / "intrinsic" / "intrinsic_depth.txt"
+    # Registered depth often comes without a file of its own: None says "as the colour image".
+    if depths and depth_intrinsics.exists():
+        depth_K = _read_intrinsics(depth_intrinsics, _common_size(list(depths.values())))
+    return SceneFiles(images, poses, depths, image_size, K, depth_K)
 
 
 def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
@@ -115,16 +166,17 @@ def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatAr
     return cam_from_world
 
 
-def _is_scene(path: Path) -> bool:
+def is_scene(path: Path) -> bool:
+    """Whether the folder itself holds a scene, or the beginning of one."""
     return any((path / name).is_dir() for name in ("color", "pose", "intrinsic"))
 
 
 def _find_scene(path: Path) -> Path:
-    """The folder that holds color/ and pose/: this one, or the only scene inside."""
+    """The folder that holds a scene: this one, or the only one inside."""
     scene = path
-    if not _is_scene(path):
+    if not is_scene(path):
         nests = [path, *(path / name for name in NESTING if (path / name).is_dir())]
-        scenes = sorted(child for nest in nests for child in nest.iterdir() if _is_scene(child))
+        scenes = sorted(child for nest in nests for child in nest.iterdir() if is_scene(child))
         if not scenes:
             remedy = "put the folders color, pose and intrinsic into a folder of it"
             raise UserError("there is no scene inside", nests[-1], remedy)
@@ -134,13 +186,6 @@ def _find_scene(path: Path) -> Path:
             what = f"the folder holds {len(scenes)} scenes ({names}{more})"
             raise UserError(what, path, "name one of them")
         scene = scenes[0]
-    remedies = {
-        "color": "put the images there: color/0.jpg, color/1.jpg, ...",
-        "pose": "put a 4x4 camera-to-world matrix there for each image: pose/0.txt, ...",
-    }
-    for name, remedy in remedies.items():
-        if not (scene / name).is_dir():
-            raise UserError(f"the capture has no folder {name}", scene, remedy)
     return scene
 
 
@@ -188,8 +233,12 @@ def _read_numbers(path: Path, *, name: str, remedy: str) -> list[float]:
     return numbers
 
 
-def _read_pose(path: Path) -> FloatArray:
-    """(4, 4) world_from_cam, not finite where tracking was lost."""
+def read_pose(path: Path) -> FloatArray:
+    """(4, 4) world_from_cam, not finite where tracking was lost.
+
+    Raises:
+        UserError: the file does not hold 16 numbers.
+    """
     remedy = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
     numbers = _read_numbers(path, name="pose", remedy=remedy)
     if len(numbers) != 16:

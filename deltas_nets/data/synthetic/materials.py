@@ -11,7 +11,6 @@ from torch import Tensor
 
 from deltas_nets.data.synthetic.furniture import Solid
 
-
 GLOSS_RANGE = (0.03, 0.6)  # polished wood to a mirror
 ROUGHNESS_RANGE = (0.003, 0.15)  # rad
 
@@ -167,7 +166,8 @@ def draw_surfaces(
     frequency = rng.uniform(0.4, 8.0, (count, 3)) * rng.choice((1.0, 0.35), (count, 1))
     phase, depth = rng.uniform(0, 2 * np.pi, (count, 3)), rng.uniform(0, 0.4, (count, 1))
     shade = np.concatenate([frequency, phase, depth], axis=1)
-    roughness = np.exp(rng.uniform(*np.log(ROUGHNESS_RANGE), count))
+    smooth, rough = np.log(ROUGHNESS_RANGE)
+    roughness = np.exp(rng.uniform(smooth, rough, count))
     looks = (scale, offset, tint, contrast, shade, gloss, roughness)
     return Surfaces(
         torch.from_numpy(texture), *(torch.from_numpy(values).float() for values in looks)

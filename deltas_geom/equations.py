@@ -1,0 +1,187 @@
+"""The equations that observations put to points, in frames where they are easy to solve."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.ldl import Symmetric4, Vector4
+from deltas_geom.normal_matrix import alike_coefficients, alike_normal_matrix, normal_matrix
+from deltas_geom.observations import (
+    Cameras,
+    Observations,
+    Weights,
+    alike_weights,
+    cameras_of,
+    check_pixels,
+    clean_pixels,
+    over_views,
+    weigh_pixels,
+)
+from deltas_geom.rig_frame import RigFrame, in_frame, rig_frames
+
+
+class Posed(NamedTuple):
+    """The points' equations, in frames where they are easy.
+
+    Attributes:
+        observed: what was seen.
+        around: ``(*B, 1, 3)`` the origin of the sums, in the world.
+        proj: ``(*B, V, 3, 4)`` of points relative to it.
+        centers: ``(*B, V, 3)`` of the cameras, in the world.
+        frame: of the points.
+        normal: ten ``(*B, N)``, in the frame.
+        dtype: of the inputs.
+    """
+
+    observed: Observations
+    around: Tensor
+    proj: Tensor
+    centers: Tensor
+    frame: RigFrame
+    normal: Symmetric4
+    dtype: torch.dtype
+
+
+class Alike(NamedTuple):
+    """Cameras of points that all weigh the same, and the one frame of these.
+
+    Attributes:
+        cameras: in the solver's type.
+        weights: of one point for all.
+        around: see :class:`Posed`.
+        near: its ``proj``.
+        frame: of one point for all.
+        coefficients: of the normal matrix in the frame.
+    """
+
+    cameras: Cameras
+    weights: Weights
+    around: Tensor
+    near: Tensor
+    frame: RigFrame
+    coefficients: Tensor
+
+
+def prepared(
+    proj: Tensor, weights: Tensor | None, mask: Tensor | None, *, kind: str
+) -> Cameras | Alike:
+    """What :func:`pose` needs that does not depend on any point.
+
+    Args:
+        proj: ``(*B, V, 3, 4)``.
+        weights: see :func:`deltas_geom.observations.weigh`.
+        mask: see there.
+        kind: of the frames, "rig" or "world".
+    """
+    cameras = cameras_of(proj)
+    if weights is not None or mask is not None:
+        return cameras
+    alike = alike_weights(cameras.proj)
+    around, near, frame = _frames(cameras, alike, kind, proj.dtype)
+    # Few cameras are moved, not every matrix.
+    coefficients = alike_coefficients(_cameras_in_frame(near, frame), alike.squared)
+    return Alike(cameras, alike, around, near, frame, coefficients)
+
+
+def pose(
+    known: Cameras | Alike,
+    pixels: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    *,
+    kind: str,
+    dtype: torch.dtype,
+) -> Posed:
+    """The equations of points.
+
+    Args:
+        known: of :func:`prepared`.
+        pixels: ``(*B, V, N, 2)``; those of unused views may hold anything.
+        weights: as for :func:`prepared`.
+        mask: as for :func:`prepared`.
+        kind: as for :func:`prepared`.
+        dtype: of the cameras, before.
+    """
+    if isinstance(known, Alike):
+        return _pose_alike(known, pixels, dtype)
+    cameras = known
+    xy, weighed = weigh_pixels(cameras, pixels, weights, mask)
+    around, near, frame = _frames(cameras, weighed, kind, dtype)
+    x, y = xy.unbind(dim=-2)
+    normal = _ten(normal_matrix(near, x, y, weighed.squared))
+    normal = in_frame(normal, frame.origin, frame.unit)
+    observed = Observations(cameras.proj, cameras.sick, xy, weighed)
+    return Posed(observed, around, near, cameras.centers, frame, normal, dtype)
+
+
+def _pose_alike(known: Alike, pixels: Tensor, dtype: torch.dtype) -> Posed:
+    cameras, weights, around, near, frame, coefficients = known
+    check_pixels(cameras, pixels)
+    xy, sound = clean_pixels(pixels)
+    normal = _ten(alike_normal_matrix(coefficients, xy))
+    sound = sound.all(dim=-2)
+    observed = Observations(
+        cameras.proj, cameras.sick, xy, weights._replace(sound=weights.sound & sound)
+    )
+    frame = frame._replace(finite=frame.finite & sound)
+    return Posed(observed, around, near, cameras.centers, frame, normal, dtype)
+
+
+def _frames(
+    cameras: Cameras, weights: Weights, kind: str, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, RigFrame]:
+    """The origin of the sums, cameras of points relative to it, and the frames of points."""
+    around, frame = rig_frames(cameras.centers, weights, cameras.sick, eps=torch.finfo(dtype).eps)
+    rows = cameras.proj[..., :3]
+    moved = cameras.proj[..., 3:] + rows @ around.unsqueeze(-3).mT
+    near = torch.cat([rows.expand(*moved.shape[:-1], 3), moved], dim=-1)
+    if kind == "world":
+        ox, oy, oz = (-middle.expand_as(frame.unit) for middle in around.unbind(dim=-1))
+        frame = frame._replace(origin=(ox, oy, oz), unit=torch.ones_like(frame.unit))
+    return around, near, frame
+
+
+def _ten(entries: tuple[Tensor, ...]) -> Symmetric4:
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = entries
+    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+
+
+def _cameras_in_frame(proj: Tensor, frame: RigFrame) -> Tensor:
+    """P T of cameras ``(*B, V, 3, 4)``, where :func:`in_frame` takes M to T^T M T."""
+    rows = proj[..., :3]
+    origin = torch.stack(frame.origin, dim=-2).unsqueeze(-3)  # (*B, 1, 3, 1)
+    last = (rows @ origin + proj[..., 3:]) / frame.unit[..., None, None]
+    return torch.cat([rows.expand(*last.shape[:-1], 3), last], dim=-1)
+
+
+def product_of(posed: Posed, v: Vector4) -> Vector4:
+    """A^T W^2 (A v) of the equations in the frame: the normal matrix times v, unsquared."""
+    (ox, oy, oz), inverse = posed.frame.origin, 1 / posed.frame.unit
+    w = v[3] * inverse
+    place = (torch.addcmul(v[0], ox, w), torch.addcmul(v[1], oy, w), torch.addcmul(v[2], oz, w))
+    p, squared = posed.proj, posed.observed.weights.squared
+    x, y = posed.observed.xy.unbind(dim=-2)
+    a, b, c = (_homogeneous_in_views(p[..., row, :], (*place, w)) for row in range(3))
+    across, down = (x * c - a) * squared, (y * c - b) * squared
+    sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
+    g0, g1, g2, g3 = over_views(p.flatten(-3, -2).mT, sums)
+    return g0, g1, g2, (ox * g0 + oy * g1 + oz * g2 + g3) * inverse
+
+
+def _homogeneous_in_views(row: Tensor, points: Vector4) -> Tensor:
+    total = row[..., 3, None] * points[3].unsqueeze(-2)
+    for axis in range(3):
+        total = torch.addcmul(total, row[..., axis, None], points[axis].unsqueeze(-2))
+    return total
+
+
+def columns_of(observed: Observations) -> Vector4:
+    """Columns ``(*B, 2 V, N)`` of the weighted equations in the world."""
+    weight = observed.weights.squared.sqrt().unsqueeze(-2)
+    xy = observed.xy * weight
+    c0, c1, c2, c3 = (
+        torch.addcmul(xy * p[..., 2:, :], weight, p[..., :2, :], value=-1).flatten(-3, -2)
+        for p in observed.proj.unsqueeze(-1).unbind(dim=-2)
+    )
+    return c0, c1, c2, c3
