@@ -15,13 +15,14 @@ GEOMETRY = "triangulation and sparse depth"
 
 @contextmanager
 def timed_stages(model: Deltas) -> Iterator[dict[str, float]]:
-    """Measure the model's calls inside the block.
+    """Measure the model's predictions inside the block.
 
     Yields:
-        Seconds by stage, filled while the block runs; what lies between the modules is the
-        triangulation. "total" is the whole forward.
+        Seconds by stage, filled while the block runs. "total" runs from the first stage of a
+        prediction to the end of the densifier; what lies between the modules is the
+        triangulation.
     """
-    seconds: dict[str, float] = {}
+    seconds = dict.fromkeys((*MODULES, GEOMETRY, "total"), 0.0)
     began: dict[str, float] = {}
     device = next(model.parameters()).device
 
@@ -31,14 +32,26 @@ def timed_stages(model: Deltas) -> Iterator[dict[str, float]]:
         return time.perf_counter()
 
     def start(name: str) -> Any:
-        return lambda *_: began.update({name: now()})
+        def hook(*_: Any) -> None:
+            began[name] = now()
+            began.setdefault("total", began[name])
+
+        return hook
 
     def stop(name: str) -> Any:
-        return lambda *_: seconds.update({name: seconds.get(name, 0.0) + now() - began[name]})
+        def hook(*_: Any) -> None:
+            ended = now()
+            seconds[name] += ended - began[name]
+            if name == MODULES[-1]:
+                seconds["total"] += ended - began.pop("total")
+                inside = sum(seconds[name] for name in MODULES)
+                seconds[GEOMETRY] = seconds["total"] - inside
 
-    stages = {name: getattr(model, name) for name in MODULES} | {"total": model}
+        return hook
+
     handles = []
-    for name, module in stages.items():
+    for name in MODULES:
+        module = getattr(model, name)
         handles.append(module.register_forward_pre_hook(start(name)))
         handles.append(module.register_forward_hook(stop(name)))
     try:
@@ -46,7 +59,3 @@ def timed_stages(model: Deltas) -> Iterator[dict[str, float]]:
     finally:
         for handle in handles:
             handle.remove()
-        if "total" in seconds:
-            inside = sum(seconds[name] for name in MODULES)
-            total = seconds.pop("total")
-            seconds.update({GEOMETRY: total - inside, "total": total})

@@ -165,7 +165,7 @@ FORMULAS: dict[str, Formula] = _table(
             "count_nonzero equal cumsum cumprod _adaptive_avg_pool2d _adaptive_avg_pool3d",
             _per_input(1),
         ),
-        ("linalg_vector_norm norm", _per_input(2)),
+        ("linalg_vector_norm norm dot vdot", _per_input(2)),
         ("var std var_mean std_mean logsumexp", _per_input(4)),
         ("avg_pool2d max_pool2d_with_indices", _pooling(2)),
         ("avg_pool3d max_pool3d_with_indices", _pooling(3)),

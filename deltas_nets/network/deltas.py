@@ -92,7 +92,11 @@ class Deltas(nn.Module):
         self.descriptor = stages.descriptor
         self.matcher = stages.matcher
         self.densifier = stages.densifier
-        self.calibration = SpreadCalibration()
+
+    @property
+    def calibration(self) -> SpreadCalibration:
+        """What makes the standard deviation of the dense map true."""
+        return self.densifier.calibration
 
     def forward(
         self,

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
+from deltas_nets.network.calibration import SpreadCalibration
 from deltas_nets.network.encoder import CHANNELS, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
 
@@ -120,6 +121,7 @@ class Densifier(nn.Module):
             ]
         )
         self.spread = nn.Conv2d(half, 1, 3, padding=1)
+        self.calibration = SpreadCalibration()
 
     def forward(self, features: Features, sparse: SparseDepth) -> DenseDepth:
         """Densify ``(B, 1, H, W)`` sparse depth of the anchor."""

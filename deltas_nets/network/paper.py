@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from deltas_geom import SparseDepth
 from deltas_nets.config import DetectorConfig
 from deltas_nets.errors import UserError
+from deltas_nets.network.calibration import SpreadCalibration
 from deltas_nets.network.densifier import DenseDepth
 from deltas_nets.network.descriptor import Descriptors
 from deltas_nets.network.detector import Keypoints, choose_keypoints
@@ -152,6 +153,7 @@ class PaperDensifier(nn.Module):
             nn.init.normal_(scale.weight, std=0.01)
             nn.init.constant_(scale.bias, math.log(TYPICAL_DEPTH))  # type: ignore[arg-type]
         self.spread = nn.Conv2d(widths[3], 1, 1)
+        self.calibration = SpreadCalibration()
 
     def forward(self, features: ViewTaps, sparse: SparseDepth) -> DenseDepth:
         """Densify ``(B, 1, H, W)`` sparse depth of the anchor."""

@@ -291,9 +291,9 @@ def test_weights_without_a_calibration_load_as_the_identity(tmp_path: Path) -> N
     model.calibration.set(torch.arange(-6.0, 2.0), torch.arange(-6.0, 2.0) + 3)
     model.load_state_dict(dict(old))
     assert torch.equal(model.calibration.values, SpreadCalibration().values)
-    assert "calibration.knots" not in old
+    assert "densifier.calibration.knots" not in old
     # Half a calibration is a damaged file.
-    half = old | {"calibration.knots": torch.zeros(NUM_KNOTS)}
+    half = old | {"densifier.calibration.knots": torch.zeros(NUM_KNOTS)}
     with pytest.raises(RuntimeError, match=r"calibration\.values"):
         model.load_state_dict(half)
     save_weights(tmp_path / "w.safetensors", model, {})
@@ -309,12 +309,12 @@ def test_fitting_on_rooms_replaces_what_was_fitted_before() -> None:
     counted: list[str] = []
     first = fit_calibration(model, kept, report=counted.append)
     values = model.calibration.values.clone()
-    assert not torch.equal(values, before["calibration.values"])
+    assert not torch.equal(values, before["densifier.calibration.values"])
     second = fit_calibration(model, kept)
     assert first == second and torch.equal(values, model.calibration.values)
     assert len(counted) == 2
     changed = [n for n, t in model.state_dict().items() if not torch.equal(t, before[n])]
-    assert changed == ["calibration.knots", "calibration.values"]
+    assert changed == ["densifier.calibration.knots", "densifier.calibration.values"]
 
 
 # Rooms and commands
