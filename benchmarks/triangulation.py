@@ -21,7 +21,12 @@ from deltas_geom.testing.targets import KORNIA_SOLVERS, kornia, opencv
 NUM_POINTS = 100_000
 REPEATS = 7
 # Inductor would cut the one loop into pieces, and carry everything between them through memory.
-COMPILED = {"fullgraph": True, "dynamic": False, "options": {"max_fusion_size": 2000}}
+# It would also give up vector instructions where pixels are not next to each other in memory.
+COMPILED = {
+    "fullgraph": True,
+    "dynamic": False,
+    "options": {"max_fusion_size": 2000, "cpp.enable_tiling_heuristics": False},
+}
 Scene = tuple[Tensor, Tensor, Tensor, Tensor]
 
 

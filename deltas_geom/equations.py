@@ -1,15 +1,17 @@
 """The equations that observations put to points, in frames where they are easy to solve."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from deltas_geom.ldl import Symmetric4, Vector4
+from deltas_geom.ldl import Symmetric4, Vector4, dot, multiply, unit
 from deltas_geom.normal_matrix import alike_coefficients, alike_normal_matrix, normal_matrix
+from deltas_geom.null_vector import solve_in_complement
 from deltas_geom.observations import (
     Cameras,
     Observations,
+    Vector3,
     Weights,
     alike_weights,
     cameras_of,
@@ -18,7 +20,13 @@ from deltas_geom.observations import (
     over_views,
     weigh_pixels,
 )
-from deltas_geom.rig_frame import RigFrame, in_frame, rig_frames
+from deltas_geom.rig_frame import (
+    RigFrame,
+    derivable_vector,
+    in_frame,
+    of_trace_one,
+    rig_frames,
+)
 
 
 class Posed(NamedTuple):
@@ -157,16 +165,27 @@ def _cameras_in_frame(proj: Tensor, frame: RigFrame) -> Tensor:
 
 def product_of(posed: Posed, v: Vector4) -> Vector4:
     """A^T W^2 (A v) of the equations in the frame: the normal matrix times v, unsquared."""
-    (ox, oy, oz), inverse = posed.frame.origin, 1 / posed.frame.unit
-    w = v[3] * inverse
-    place = (torch.addcmul(v[0], ox, w), torch.addcmul(v[1], oy, w), torch.addcmul(v[2], oz, w))
     p, squared = posed.proj, posed.observed.weights.squared
     x, y = posed.observed.xy.unbind(dim=-2)
-    a, b, c = (_homogeneous_in_views(p[..., row, :], (*place, w)) for row in range(3))
-    across, down = (x * c - a) * squared, (y * c - b) * squared
+    across, down = (error * squared for error in _errors(posed, v))
     sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
     g0, g1, g2, g3 = over_views(p.flatten(-3, -2).mT, sums)
-    return g0, g1, g2, (ox * g0 + oy * g1 + oz * g2 + g3) * inverse
+    ox, oy, oz = posed.frame.origin
+    return g0, g1, g2, (ox * g0 + oy * g1 + oz * g2 + g3) / posed.frame.unit
+
+
+def _errors(posed: Posed, v: Vector4) -> tuple[Tensor, Tensor]:
+    """A v of the equations in the frame: two ``(*B, V, N)``."""
+    place = _out_of_frame(posed.frame, v)
+    x, y = posed.observed.xy.unbind(dim=-2)
+    a, b, c = (_homogeneous_in_views(posed.proj[..., row, :], place) for row in range(3))
+    return x * c - a, y * c - b
+
+
+def _out_of_frame(frame: RigFrame, v: Vector4) -> Vector4:
+    """T v, where :func:`in_frame` takes M to T^T M T."""
+    (ox, oy, oz), w = frame.origin, v[3] / frame.unit
+    return torch.addcmul(v[0], ox, w), torch.addcmul(v[1], oy, w), torch.addcmul(v[2], oz, w), w
 
 
 def _homogeneous_in_views(row: Tensor, points: Vector4) -> Tensor:
@@ -174,6 +193,84 @@ def _homogeneous_in_views(row: Tensor, points: Vector4) -> Tensor:
     for axis in range(3):
         total = torch.addcmul(total, row[..., axis, None], points[axis].unsqueeze(-2))
     return total
+
+
+def lagrangian_of(posed: Posed, place: Vector3, valid: Tensor, gradient: Vector3) -> Tensor:
+    """What changes with the equations as the sum of gradient * points does, to first order.
+
+    A change dM of the normal matrix changes its null vector x by -(M - mu)^+ dM x, and with it a
+    sum whose gradient by x is g by -y^T dM x, y = (M - mu)^+ g. Held x and y, the derivative of
+    y^T M x is a product of the errors of both: nothing of how x was found is derived.
+
+    Args:
+        posed: differentiable.
+        place: the points in the frame, in units of it; anything where not valid.
+        valid: ``(*B, N)`` bool.
+        gradient: three ``(*B, N)`` by the points.
+
+    Returns:
+        ``(*B, N)``, whose value means nothing.
+    """
+    frame = posed.frame
+    with torch.no_grad():
+        matrix, share = of_trace_one(posed.normal, valid)
+        one, zero = torch.ones_like(share), share.new_zeros(())
+        # What was kept of the vector is rounded; the step takes it to the solver's rounding.
+        x0, x1, x2, x3 = derivable_vector(matrix, (*place, one), valid)
+        g0, g1, g2 = (torch.where(valid, component, zero) for component in gradient)
+        d0, d1, d2 = x0 / x3, x1 / x3, x2 / x3
+        x = unit((x0, x1, x2, x3))
+        scale = frame.unit * share / x[3]
+        of_x = (g0 * scale, g1 * scale, g2 * scale, -(g0 * d0 + g1 * d1 + g2 * d2) * scale)
+        y = solve_in_complement(matrix, x, dot(x, multiply(matrix, x)), of_x)
+    ox, oy, oz = frame.origin
+    moved = g0 * (frame.unit * d0 + ox) + g1 * (frame.unit * d1 + oy) + g2 * (frame.unit * d2 + oz)
+    return moved - _product_of_errors(posed, y, x)
+
+
+def _product_of_errors(posed: Posed, u: Vector4, v: Vector4) -> Tensor:
+    """u^T A^T W^2 A v of the equations in the frame."""
+    squared = posed.observed.weights.squared
+    if not torch.compiler.is_compiling():
+        (across, down), (along, below) = _errors(posed, u), _errors(posed, v)
+        return (squared * (across * along + down * below)).sum(dim=-2)
+    # View by view, which a compiler fuses with what stands around it.
+    rows = posed.proj.flatten(-3, -2)
+    first, second = (
+        _FusedProduct.apply(rows, *_out_of_frame(posed.frame, z))  # type: ignore[no-untyped-call]
+        for z in (u, v)
+    )
+    total = torch.zeros_like(u[0])
+    for view in range(squared.shape[-2]):
+        x, y = posed.observed.xy[..., view, :, :].unbind(dim=-2)
+        (a, b, c), (d, e, f) = (rows[3 * view : 3 * view + 3] for rows in (first, second))
+        product = torch.addcmul((x * c - a) * (x * f - d), y * c - b, y * f - e)
+        total = torch.addcmul(total, squared[..., view, :], product)
+    return total
+
+
+class _FusedProduct(torch.autograd.Function):
+    """Matrices ``(*B, K, 4)`` times vectors, for which nothing is stacked; backward by rows."""
+
+    @staticmethod
+    def forward(rows: Tensor, v0: Tensor, v1: Tensor, v2: Tensor, v3: Tensor) -> tuple[Tensor, ...]:
+        return tuple(_linear(row, (v0, v1, v2, v3)) for row in rows.unbind(dim=-2))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Any) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
+        rows, *v = ctx.saved_tensors
+        of_rows = torch.stack(gradients, dim=-2) @ torch.stack(v, dim=-2).mT
+        of_v = (_linear(column, gradients) for column in rows.unbind(dim=-1))
+        return of_rows.sum_to_size(rows.shape), *of_v
+
+
+def _linear(factors: Tensor, values: tuple[Tensor, ...]) -> Tensor:
+    parts = [f.unsqueeze(-1) * v for f, v in zip(factors.unbind(-1), values, strict=True)]
+    return sum(parts[1:], parts[0])
 
 
 def columns_of(observed: Observations) -> Vector4:

@@ -222,11 +222,11 @@ def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
         Of about unit length. Where M - mu is not definite in the complement of x, x itself.
     """
     image = multiply(matrix, x)
-    change = _solve_in_complement(matrix, x, dot(x, image), image)
+    change = solve_in_complement(matrix, x, dot(x, image), image)
     return x[0] - change[0], x[1] - change[1], x[2] - change[2], x[3] - change[3]
 
 
-def _solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) -> Vector4:
+def solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) -> Vector4:
     """(M - mu)^+ g in the 3-space orthogonal to the unit vector x.
 
     A Householder reflection takes x to the last axis; what is left is a definite 3x3 system.

@@ -12,6 +12,33 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 
+class WithLagrangian:
+    """A function of :func:`recomputed` whose gradient needs less than the function again.
+
+    Where outputs solve equations, the gradient follows from the equations and the solution,
+    however that was found. The first output alone has a gradient; the others are kept too.
+
+    Attributes:
+        function: as for :func:`recomputed`.
+        lagrangian: from the other outputs, the gradient of the first, and the inputs: a tensor
+            whose sum has the derivatives of sum(gradient * output) by the inputs, to first order.
+
+    Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 15 (implicit).
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., tuple[Tensor, ...]],
+        lagrangian: Callable[..., Tensor],
+    ) -> None:
+        self.function = function
+        self.lagrangian = lagrangian
+
+    def __call__(self, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        """All outputs, differentiably."""
+        return self.function(*tensors)
+
+
 def recomputed(
     function: Callable[..., tuple[Tensor, ...]],
     *tensors: Tensor | None,
@@ -58,6 +85,13 @@ def _has_tangent(tensor: Tensor | None) -> bool:
     return tangent is not None
 
 
+def _in_batch(tensor: Tensor | None) -> bool:
+    """Does ``vmap`` run, that of ``torch.func`` or of ``is_grads_batched``?"""
+    if torch._C._are_functorch_transforms_active():
+        return True
+    return tensor is not None and torch._C._functorch.is_legacy_batchedtensor(tensor)
+
+
 class _Recomputed(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -66,23 +100,28 @@ class _Recomputed(torch.autograd.Function):
         values: Callable[..., tuple[Tensor, ...]],
         *tensors: Tensor | None,
     ) -> tuple[Tensor, ...]:
-        ctx.function = function
-        ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        outputs = values(*tensors)
-        ctx.mark_non_differentiable(*(out for out in outputs if not out.is_floating_point()))
-        return outputs
+        return _kept(ctx, function, values, tensors)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         needed = ctx.needs_input_grad[2:]
         higher = torch.is_grad_enabled()  # a second derivative is wanted of what is done here
+        tensors, found = ctx.saved_tensors[: len(needed)], ctx.saved_tensors[len(needed) :]
         inputs = [
             tensor if tensor is None or higher else tensor.detach().requires_grad_(asked)
-            for tensor, asked in zip(ctx.saved_tensors, needed, strict=True)
+            for tensor, asked in zip(tensors, needed, strict=True)
         ]
+        # A sum of gradients in a batch could not tell one from the other.
+        batched = _in_batch(gradients[0])
         with torch.enable_grad():
-            outputs = ctx.function(*inputs)
+            if isinstance(ctx.function, WithLagrangian) and not (higher or batched):
+                if gradients[0] is None:
+                    return (None, None, *(None for _ in inputs))
+                outputs = (ctx.function.lagrangian(found, gradients[0], *inputs),)
+                gradients = (torch.ones_like(outputs[0]),)
+            else:
+                outputs = ctx.function(*inputs)
         followed = [
             (output, gradient)
             for output, gradient in zip(outputs, gradients, strict=True)
@@ -91,7 +130,7 @@ class _Recomputed(torch.autograd.Function):
         wanted = [tensor for tensor, asked in zip(inputs, needed, strict=True) if asked]
         if not followed:
             return (None, None, *(None for _ in inputs))
-        found = iter(
+        pulled = iter(
             torch.autograd.grad(
                 [output for output, _ in followed],
                 [tensor for tensor in wanted if tensor is not None],
@@ -100,7 +139,7 @@ class _Recomputed(torch.autograd.Function):
                 allow_unused=True,
             )
         )
-        return (None, None, *(next(found) if asked else None for asked in needed))
+        return (None, None, *(next(pulled) if asked else None for asked in needed))
 
 
 class _Traced(torch.autograd.Function):
@@ -111,26 +150,48 @@ class _Traced(torch.autograd.Function):
         values: Callable[..., tuple[Tensor, ...]],
         *tensors: Tensor | None,
     ) -> tuple[Tensor, ...]:
-        ctx.function = function
-        ctx.save_for_backward(*tensors)
-        outputs = values(*tensors)
+        outputs = _kept(ctx, function, values, tensors)
         ctx.floating = tuple(out.is_floating_point() for out in outputs)
-        ctx.mark_non_differentiable(*(out for out in outputs if not out.is_floating_point()))
         return outputs
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[2:]
+        tensors, found = ctx.saved_tensors[: len(needed)], ctx.saved_tensors[len(needed) :]
         function = ctx.function
-        places = [k for k, t in enumerate(tensors) if t is not None and ctx.needs_input_grad[2 + k]]
+        followed = tuple(g for g, has in zip(gradients, ctx.floating, strict=True) if has)
+        # What depends on inputs alone the compiler would compute in the forward pass, and keep.
+        never = (followed[0] > torch.inf).any()
+        tensors = [None if t is None else torch.where(never, t.new_zeros(()), t) for t in tensors]
+        places = [k for k, t in enumerate(tensors) if t is not None and needed[k]]
 
         def of_needed(*needed: Tensor) -> tuple[Tensor, ...]:
             inputs = list(tensors)
             for place, tensor in zip(places, needed, strict=True):
                 inputs[place] = tensor
+            if isinstance(function, WithLagrangian):
+                return (function.lagrangian(found, followed[0], *inputs),)
             return tuple(out for out in function(*inputs) if out.is_floating_point())
 
-        _, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
-        followed = tuple(g for g, has in zip(gradients, ctx.floating, strict=True) if has)
-        found = dict(zip(places, pull(followed), strict=True))
-        return (None, None, *(found.get(k) for k in range(len(tensors))))
+        outputs, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
+        if isinstance(function, WithLagrangian):
+            followed = (torch.ones_like(outputs[0]),)
+        pulled = dict(zip(places, pull(followed), strict=True))
+        return (None, None, *(pulled.get(k) for k in range(len(tensors))))
+
+
+def _kept(
+    ctx: Any,
+    function: Callable[..., tuple[Tensor, ...]],
+    values: Callable[..., tuple[Tensor, ...]],
+    tensors: tuple[Tensor | None, ...],
+) -> tuple[Tensor, ...]:
+    """The values, after ``ctx`` was told what to keep for backward."""
+    ctx.function = function
+    outputs = values(*tensors)
+    short = isinstance(function, WithLagrangian)
+    ctx.save_for_backward(*tensors, *(outputs[1:] if short else ()))
+    ctx.mark_non_differentiable(
+        *(out for k, out in enumerate(outputs) if (short and k > 0) or not out.is_floating_point())
+    )
+    return outputs

@@ -206,6 +206,15 @@ def derivable_points(
         vector: found for ``normal``.
         valid: ``(*B, N)`` bool.
     """
+    matrix, _ = of_trace_one(normal, valid)
+    x0, x1, x2, x3 = derivable_vector(matrix, vector, valid)
+    return _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
+
+
+def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]:
+    """The matrices divided by their traces, easy ones where not valid; and what they were
+    multiplied by, without gradient.
+    """
     # Double where: what has failed must pass no gradient and no NaN.
     easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
     trace = torch.where(valid, normal[0] + normal[4] + normal[7] + normal[9], 1.0).detach()
@@ -215,16 +224,26 @@ def derivable_points(
         torch.where(valid, entry, constant) * share
         for entry, constant in zip(normal, easy, strict=True)
     )
+    return (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), share
+
+
+def derivable_vector(matrix: Symmetric4, vector: Vector4, valid: Tensor) -> Vector4:
+    """The null vector, of about unit length, as a function of the matrix of trace 1.
+
+    Args:
+        matrix: of :func:`of_trace_one`.
+        vector: its null vector, of any length; anything where not valid.
+        valid: ``(*B, N)`` bool.
+    """
     x0, x1, x2, x3 = (
         torch.where(valid, component.detach(), constant)
         for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
     )
     start = unit((x0, x1, x2, x3))
-    x0, x1, x2, x3 = rayleigh_step((m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), start)
+    x0, x1, x2, x3 = rayleigh_step(matrix, start)
     # Below the step's rounding there is no derivative, and not even a sign to divide by.
     lost = start[3].abs() <= 4 * torch.finfo(x3.dtype).eps
-    x3 = torch.where(lost, start[3], x3)
-    return _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
+    return x0, x1, x2, torch.where(lost, start[3], x3)
 
 
 def in_world(points: Vector3, around: Tensor) -> Vector3:

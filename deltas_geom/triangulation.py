@@ -1,7 +1,8 @@
 """Weighted, masked n-view DLT triangulation; every point carries a Status.
 
 Each point is solved in its own rig frame (rig_frame.py), in float64 whatever the input, where the
-device has it. Backward keeps only the inputs and computes the rest again.
+device has it. Backward keeps the inputs, for points alone also the points, and computes the rest
+again.
 """
 
 from typing import Literal, NamedTuple
@@ -10,9 +11,18 @@ import torch
 from torch import Tensor
 
 from deltas_geom.chunks import in_chunks, surely_all
-from deltas_geom.equations import Alike, Posed, columns_of, pose, prepared, product_of
+from deltas_geom.equations import (
+    Alike,
+    Posed,
+    columns_of,
+    lagrangian_of,
+    pose,
+    prepared,
+    product_of,
+)
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Cameras, Observations, Vector3
+from deltas_geom.recompute import WithLagrangian
 from deltas_geom.rig_frame import (
     FoundPoints,
     derivable_points,
@@ -70,16 +80,33 @@ def triangulate_points(
     def prepare(proj: Tensor) -> Cameras | Alike:
         return prepared(proj, weights, mask, kind=frame)
 
-    def values(known: Cameras | Alike, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor]:
+    def values(known: Cameras | Alike, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
         posed = pose(known, pixels, *used, kind=frame, dtype=proj.dtype)
-        return (_outward(_values(posed, frame), proj.dtype),)
+        found, places, status = _find(posed, frame)
+        valid = status == Status.OK.value
+        points = _outward(kept_in_world(places, valid), proj.dtype)
+        return points, _places_in_frame(found, proj.dtype), valid
 
-    def derivable(proj: Tensor, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor]:
+    def derivable(proj: Tensor, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
         posed = pose(prepare(proj), pixels, *used, kind=frame, dtype=proj.dtype)
-        return (_outward(_derivable(posed, frame), proj.dtype),)
+        found, _, status = _find(posed, frame)
+        valid = status == Status.OK.value
+        near = derivable_points(posed.normal, posed.frame, found.vector, valid)
+        points = _outward(kept(near, posed.around, valid), proj.dtype)
+        return points, _places_in_frame(found, proj.dtype), valid
+
+    def lagrangian(found: tuple[Tensor, ...], gradient: Tensor, *tensors: Tensor | None) -> Tensor:
+        cameras, pixels, *used = tensors
+        assert cameras is not None and pixels is not None
+        posed = pose(prepare(cameras), pixels, *used, kind=frame, dtype=cameras.dtype)
+        places, valid = found
+        x, y, z = places.to(posed.around.dtype).unbind(dim=-2)
+        gx, gy, gz = gradient.to(posed.around.dtype).unbind(dim=-1)
+        return lagrangian_of(posed, (x, y, z), valid, (gx, gy, gz))
 
     points = ((pixels, -2), (weights, -1), (mask, -1))
-    return in_chunks(derivable, values, proj, points, dims=(-2,), prepare=prepare)[0]
+    function = WithLagrangian(derivable, lagrangian)
+    return in_chunks(function, values, proj, points, dims=(-2, -1, -1), prepare=prepare)[0]
 
 
 def triangulate(
@@ -224,8 +251,16 @@ def _derivable(posed: Posed, frame: str) -> _Solved:
     return _Solved(posed.observed, posed.centers, kept(near, posed.around, valid), status)
 
 
-def _outward(solved: _Solved, dtype: torch.dtype) -> Tensor:
-    return torch.stack(solved.points, dim=-1).to(dtype)
+def _outward(points: Vector3, dtype: torch.dtype) -> Tensor:
+    return torch.stack(points, dim=-1).to(dtype)
+
+
+def _places_in_frame(found: FoundPoints, dtype: torch.dtype) -> Tensor:
+    """``(*B, 3, N)`` in units of the frame, to start from; float32 at least."""
+    x, y, z, w = found.vector
+    inverse = w.reciprocal()
+    places = torch.stack([x * inverse, y * inverse, z * inverse], dim=-2)
+    return places.to(torch.promote_types(dtype, torch.float32))
 
 
 def _check_frame(frame: str) -> None:

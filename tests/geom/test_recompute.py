@@ -1,11 +1,12 @@
 """Functions that keep only their inputs for backward."""
 
+import pytest
 import torch
 from hypothesis import given
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.recompute import recomputed
+from deltas_geom.recompute import WithLagrangian, recomputed
 from deltas_geom.testing.strategies import vectors
 
 
@@ -205,3 +206,60 @@ def test_the_graph_may_be_kept_and_walked_twice() -> None:
     out, _, _ = recomputed(curved, x, y)
     first = torch.autograd.grad(out.sum(), x, retain_graph=True)[0]
     assert torch.equal(first, torch.autograd.grad(out.sum(), x)[0])
+
+
+def root(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    """r of r^3 + y^2 r = x, by Newton's method; and two more outputs."""
+    r = x / (1 + y * y)
+    for _ in range(60):
+        r = r - (r**3 + y * y * r - x) / (3 * r * r + y * y)
+    return r, r.detach().clone(), r > 0
+
+
+def implicit(found: tuple[Tensor, ...], gradient: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    r, positive = found
+    assert not r.requires_grad and positive.dtype == torch.bool
+    multiplier = gradient / (3 * r * r + y.detach() ** 2)
+    return -multiplier * (y * y * r - x)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_lagrangian_gives_the_gradient_in_place_of_the_function(compiled: bool) -> None:
+    numbers = torch.rand(2, 5, generator=torch.Generator().manual_seed(0)).double() + 0.5
+    x, y = leaves(numbers)
+
+    def solve(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        return recomputed(WithLagrangian(root, implicit), x, y)
+
+    found = (torch.compile(solve, fullgraph=True, backend="aot_eager") if compiled else solve)(x, y)
+    for ours, theirs in zip(found, root(x, y), strict=True):
+        assert_close(ours, theirs)
+    share = torch.arange(5.0).double()
+    ours = torch.autograd.grad((share * found[0]).sum(), (x, y))
+    for a, b in zip(ours, torch.autograd.grad((share * root(x, y)[0]).sum(), (x, y)), strict=True):
+        assert_close(a, b)
+
+
+def test_a_lagrangian_spares_the_function_except_for_second_derivatives() -> None:
+    calls: list[str] = []
+
+    def function(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        calls.append("function")
+        return root(x, y)
+
+    def lagrangian(*arguments: tuple[Tensor, ...] | Tensor) -> Tensor:
+        calls.append("lagrangian")
+        return implicit(*arguments)  # type: ignore[arg-type]
+
+    x, y = leaves(torch.tensor([[0.5, 1.0], [1.0, 1.5]]).double())
+    both = WithLagrangian(function, lagrangian)
+    recomputed(both, x, y, values=root)[0].sum().backward()
+    assert calls == ["lagrangian"]
+    assert torch.autograd.gradgradcheck(lambda x, y: recomputed(both, x, y)[0], (x, y))
+    kept: list[Tensor] = []
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda tensor: kept.append(tensor) or tensor,  # type: ignore[func-returns-value]
+        lambda tensor: tensor,
+    ):
+        recomputed(both, x, y)
+    assert len(kept) == 4  # the inputs, and the outputs but the first
