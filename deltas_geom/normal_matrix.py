@@ -25,10 +25,24 @@ def normal_matrix(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[
     Returns:
         K (K + 1) / 2 entries ``(*B, N)``.
     """
+    if torch.compiler.is_compiling():
+        return _by_views(proj, x, y, squared)
     across, down = x * squared, y * squared
     square = torch.addcmul(x * across, y, down)
     terms = torch.stack([square, across, down, squared.expand_as(across)], dim=-2)
     return over_views(_coefficients(proj).flatten(-3, -2).mT, terms.flatten(-3, -2))
+
+
+def _by_views(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[Tensor, ...]:
+    """The same without a product of matrices, so that a compiler fuses it with what follows."""
+    entries = [torch.zeros_like(x[..., 0, :])] * (proj.shape[-1] * (proj.shape[-1] + 1) // 2)
+    for view, coefficients in enumerate(_coefficients(proj).unbind(dim=-3)):
+        weight, along, down = (part[..., view, :] for part in (squared, x, y))
+        square = along * along + down * down
+        for n, column in enumerate(coefficients.unbind(dim=-1)):
+            a, b, c, d = (factor.unsqueeze(-1) for factor in column.unbind(dim=-1))
+            entries[n] = entries[n] + weight * (a * square + b * along + c * down + d)
+    return tuple(entries)
 
 
 def _coefficients(proj: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from deltas_geom.normal_matrix import (
     Symmetric3,
+    _by_views,
     alike_coefficients,
     alike_normal_matrix,
     inverse3,
@@ -178,3 +179,14 @@ def test_batches_broadcast_cameras_against_points() -> None:
     one = normal_matrix(proj[3, 0], x[4], y[4], squared[4])
     for entry, wanted in zip(found, one, strict=True):
         assert_close(entry[3, 4], wanted)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_view_by_view_it_is_the_product(rows: int) -> None:
+    random = torch.Generator().manual_seed(5)
+    proj = torch.randn(2, 3, 3, rows, generator=random, dtype=torch.float64)
+    x, y = torch.randn(2, 2, 3, 7, generator=random, dtype=torch.float64)
+    for count in (7, 1):  # weights of each point, or of all
+        squared = torch.rand(2, 3, count, generator=random, dtype=torch.float64)
+        found, expected = _by_views(proj, x, y, squared), normal_matrix(proj, x, y, squared)
+        assert_close(torch.stack(found), torch.stack(expected))

@@ -53,14 +53,16 @@ def scores(hololens: Path, three_views: Path, tmp_path_factory: pytest.TempPathF
 
 
 def test_three_views_are_accurate_and_complete(scores: dict) -> None:
-    assert scores["dense"]["abs_rel"] <= 0.12
-    assert scores["dense"]["delta1"] >= 0.88
+    assert scores["dense"]["abs_rel"] <= 0.080
+    assert scores["dense"]["delta1"] >= 0.925
     assert scores["dense"]["coverage"] >= 0.99
 
 
 def test_seven_views_are_better(scores: dict, seven_views: CaptureScores) -> None:
     assert seven_views.dense.abs_rel < scores["dense"]["abs_rel"]
     assert seven_views.dense.delta1 > scores["dense"]["delta1"]
+    assert seven_views.dense.abs_rel <= 0.069
+    assert seven_views.dense.delta1 >= 0.935
 
 
 def test_the_independent_scorer_agrees(
