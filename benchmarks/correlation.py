@@ -24,6 +24,7 @@ from deltas_geom import Samples, correlate, correlate_normalized, normalize_pixe
 
 SIZE = (240, 320)  # of the image, px
 NUM_KEYPOINTS, NUM_SAMPLES, REPEATS = 512, 300, 9
+SHORTEST = 0.1  # s, of a measurement
 Score = Callable[[Tensor, Tensor, Samples], Tensor]
 
 
@@ -72,29 +73,43 @@ def kept(score: Score, inputs: tuple[Tensor, Tensor, Samples]) -> float:
     return sum(sizes.values()) / 1e6
 
 
+def seconds(call: Callable[[], object]) -> float:
+    """Processor time of a call, the mean of as many as take a while.
+
+    One call of a few milliseconds would pay for the memory that the one before gave back.
+    """
+    call()
+    count, began = 0, time.process_time()
+    while (spent := time.process_time() - began) < SHORTEST:
+        call()
+        count += 1
+    return spent / count
+
+
 def compare(case: str, size: tuple[int, int], channels: int, scores: dict[str, Score]) -> None:
     """A table; the first function is ours."""
     inputs = scene(size, channels)
     upstream = torch.randn(inputs[2].mask.shape, generator=torch.Generator().manual_seed(1))
     times: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in scores}
     wanted: list[Tensor] = []
+
+    def forward(score: Score) -> Tensor:
+        with torch.no_grad():
+            return score(*inputs)
+
+    def both(score: Score) -> tuple[Tensor, ...]:
+        return torch.autograd.grad((score(*inputs) * upstream).sum(), inputs[:2])
+
     for repeat in range(REPEATS + 1):  # the first checks, and warms up
         for name, score in scores.items():
-            score(*inputs)  # untimed: who ran before shall not matter
-            began = time.process_time()
-            with torch.no_grad():
-                value = score(*inputs)
-            middle = time.process_time()
-            total = (score(*inputs) * upstream).sum()
-            found = [value, *torch.autograd.grad(total, inputs[:2])]
-            ended = time.process_time()
-            wanted = wanted or found
             if repeat == 0:
+                found = [forward(score), *both(score)]
+                wanted = wanted or found
                 for answer, other in zip(found, wanted, strict=True):
                     torch.testing.assert_close(answer, other, rtol=1e-4, atol=1e-4)
-            else:
-                times[name][0].append(middle - began)
-                times[name][1].append(ended - middle)
+                continue
+            times[name][0].append(seconds(partial(forward, score)))
+            times[name][1].append(seconds(partial(both, score)))
     rows = [[*map(statistics.median, times[name]), kept(scores[name], inputs)] for name in scores]
     for name, row in zip(scores, rows, strict=True):
         ratios = " ".join(f"{value / best:7.1f}x" for value, best in zip(row, rows[0], strict=True))
