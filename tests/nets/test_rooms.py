@@ -16,6 +16,7 @@ from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms, draw_room, render_room, texture_atlas
 from deltas_nets.data.synthetic.cast import cast_rays
 from deltas_nets.data.synthetic.furniture import BOX, CYLINDER, ELLIPSOID
+from deltas_nets.data.synthetic.materials import Surfaces
 from deltas_nets.data.synthetic.render import _mirror_image, render_view
 from deltas_nets.data.synthetic.scene import Room, Solids
 from deltas_nets.data.synthetic.textures import (
@@ -250,6 +251,39 @@ def test_a_polished_floor_is_the_matte_floor_and_a_share_of_the_mirrored_light()
     # Schlick: the share is linear in the gloss, g + (1 - g) k.
     twice = (much - matte)[:, floor]
     assert (twice <= 2 * gained + 1e-5).all() and (twice >= gained - 1e-5).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_mirror_image_leaves_the_mirror_where_it_is(seed: int) -> None:
+    room, _ = draw_room(seed, num_views=1, image_size=SIZE, kinds=texture_atlas().kinds)
+    for face in range(6 * len(room.solids.shape)):
+        solid, axis, sign = face // 6, face % 6 // 2, face % 2 * 2 - 1
+        places = torch.rand(5, 3, generator=torch.Generator().manual_seed(face)) * 2 - 1
+        places[:, axis] = sign
+        local = places * room.solids.half_size[solid]
+        points = local @ room.solids.local_from_world[solid] + room.solids.centre[solid]
+        image = _mirror_image(room, face)
+        assert_close(points @ image[:3, :3].mT + image[:3, 3], points, rtol=0, atol=1e-4)
+        assert_close(image @ image, torch.eye(4), rtol=0, atol=1e-4)
+        assert torch.linalg.det(image[:3, :3]) < 0
+
+
+def test_what_is_behind_a_mirror_is_not_mirrored() -> None:
+    atlas = texture_atlas()
+    room, views = polished(floor_seed(), gloss=0.5)
+    shape, centre, half_size, local_from_world = room.solids
+    cellar = Solids(
+        torch.cat([shape, torch.tensor([BOX])]),
+        torch.cat([centre, torch.tensor([[0.0, 1.0, 0.0]])]),  # y is down: under the floor
+        torch.cat([half_size, torch.tensor([[9.0, 0.2, 9.0]])]),
+        torch.cat([local_from_world, torch.eye(3)[None]]),
+    )
+    looks = Surfaces(*(torch.cat([part, part[-1:]]) for part in room.surfaces))
+    camera = views.K[0], views.cam_from_world[0]
+    expected, _ = render_view(room, atlas, *camera, image_size=SIZE)
+    below = room._replace(solids=cellar, surfaces=looks)
+    found, _ = render_view(below, atlas, *camera, image_size=SIZE)
+    assert torch.equal(found, expected)
 
 
 def test_reflections_do_not_stay_on_the_surface() -> None:
