@@ -288,7 +288,7 @@ NEEDS_COMPILER = pytest.mark.skipif(
 # What torch.compile does before a compiler sees the graph is what may break.
 @pytest.mark.parametrize(
     "backend",
-    ["aot_eager", pytest.param("inductor", marks=[pytest.mark.slow, NEEDS_COMPILER])],
+    ["aot_eager", pytest.param("inductor", marks=NEEDS_COMPILER)],
 )
 def test_both_compile_without_a_graph_break(backend: str) -> None:
     *leaves, pixels = random_scene()
