@@ -14,12 +14,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.pixels import normalize_pixels, resize_pixels
+from deltas_geom.pixels import normalizing, resize_pixels
 from deltas_geom.recompute import recomputed
 from deltas_geom.sampling import Samples
 
 _CACHED_ELEMENTS = 1 << 20  # a chunk should stay in the cache between writing and reading it
-_HELD_ELEMENTS = 1 << 26  # where there is no such cache: what one call may hold in memory
+_HELD_ELEMENTS = 1 << 28  # where there is no such cache: what one call may hold in memory
 
 
 def correlate(
@@ -135,14 +135,20 @@ def _in_pieces(
     """
     if torch.compiler.is_compiling():  # pieces would fix the number of keypoints
         return function(maps, *keypoints)
-    batch, cached = maps.shape[:-3], maps.device.type == "cpu"
-    limit = _CACHED_ELEMENTS if cached else _HELD_ELEMENTS
-    dim, held = len(batch), max(1, batch.numel() * elements)
+    batch, dim = maps.shape[:-3], maps.ndim - 3
+    held = max(1, batch.numel() * elements)
+    limit = _CACHED_ELEMENTS if maps.device.type == "cpu" else _HELD_ELEMENTS
     if keypoints[0].shape[dim] * held <= limit:
         return function(maps, *keypoints)
-    if cached and len(batch) > 0 and batch[0] > 0:
+    # Views before keypoints: each map is then read once, and its gradient is written once.
+    if batch.numel() > 1:
+        size = limit * batch[0] // (keypoints[0].shape[dim] * held)
+        if size > 0:
+            groups = zip(*(torch.split(each, size) for each in (maps, *keypoints)), strict=True)
+            return torch.cat([function(*group) for group in groups])
+    if dim > 0 and batch[0] > 0:
         # unbind and split, not indices: their backward writes every gradient once.
-        views = zip(maps.unbind(), *(tensor.unbind() for tensor in keypoints), strict=True)
+        views = zip(*(tensor.unbind() for tensor in (maps, *keypoints)), strict=True)
         return torch.stack([_in_pieces(function, *view, elements=elements) for view in views])
     chunk = max(16, limit // held)
     chunks = zip(*(torch.split(tensor, chunk, dim=dim) for tensor in keypoints), strict=True)
@@ -204,7 +210,8 @@ class _DotProducts(torch.autograd.Function):
             of_descriptors = (of_maps @ flat.mT).to(descriptors.dtype)
         if not moves:
             return of_features, of_descriptors, None, None, None
-        of_pixels = of_grid.reshape(pixels.shape) * _of_grid(ctx.image_size, like=of_grid)[1]
+        slope = normalizing(ctx.image_size, like=of_grid)[1]
+        of_pixels = of_grid.reshape(pixels.shape) * slope
         return of_features, of_descriptors, of_pixels.to(pixels.dtype), None, None
 
 
@@ -215,21 +222,14 @@ def _in_full(
     dtype = torch.promote_types(features.dtype, descriptors.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
     pixels = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
-    shift, slope = _of_grid(image_size, like=pixels).repeat(1, pixels.shape[-2]).unbind()
     # One pass along rows of x, y, x, y: four, two numbers wide, take as long as the sampling.
+    count = pixels.shape[-2]
+    shift, slope = (part.repeat(count) for part in normalizing(image_size, like=pixels))
     grid = torch.addcmul(shift, pixels.flatten(-2), slope).to(dtype)
     # The backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU). At
     # the border it has a value and no gradient.
     grid = grid.nan_to_num_(nan=-1.0).reshape(pixels.shape).flatten(0, -4)
     return features.to(dtype).flatten(-2), descriptors.to(dtype), grid
-
-
-def _of_grid(image_size: tuple[int, int], *, like: Tensor) -> Tensor:
-    """Value at pixel (0, 0) and slope of :func:`normalize_pixels`, which is affine."""
-    pixels = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
-    ends = normalize_pixels(pixels, image_size=image_size)
-    ends[1] -= ends[0]
-    return ends.to(like)
 
 
 def _masked(values: Tensor, mask: Tensor) -> Tensor:

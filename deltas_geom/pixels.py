@@ -55,12 +55,18 @@ def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
         >>> normalize_pixels(torch.tensor([-0.5, 1.5]), image_size=(2, 4))
         tensor([-1.,  1.])
     """
-    height, width = image_size
-    dtype = pixels.dtype if pixels.is_floating_point() else torch.get_default_dtype()
-    # Not torch.tensor, which copies numbers of the host to the device and waits for them.
-    slope = torch.linspace(2 / width, 2 / height, 2, device=pixels.device, dtype=dtype)
-    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=pixels.device, dtype=dtype)
+    at_zero, slope = normalizing(image_size, like=pixels)
     return torch.addcmul(at_zero, pixels, slope)
+
+
+def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
+    """What :func:`normalize_pixels` gives to pixel (0, 0), and its slope, each ``(2,)``."""
+    height, width = image_size
+    dtype = like.dtype if like.is_floating_point() else torch.get_default_dtype()
+    # Not torch.tensor, which copies numbers of the host to the device and waits for them.
+    slope = torch.linspace(2 / width, 2 / height, 2, device=like.device, dtype=dtype)
+    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=like.device, dtype=dtype)
+    return at_zero, slope
 
 
 def resize_pixels(
@@ -72,11 +78,9 @@ def resize_pixels(
         >>> resize_pixels(torch.tensor([0.0, 0.0]), old_size=(4, 4), new_size=(2, 2))
         tensor([-0.2500, -0.2500])
     """
-    scale = torch.tensor(
-        [new_size[1] / old_size[1], new_size[0] / old_size[0]],
-        device=pixels.device,
-        dtype=pixels.dtype,
-    )
+    along_x, along_y = new_size[1] / old_size[1], new_size[0] / old_size[0]
+    # As above: numbers of the host would be waited for.
+    scale = torch.linspace(along_x, along_y, 2, device=pixels.device, dtype=pixels.dtype)
     return scale * (pixels + 0.5) - 0.5
 
 
@@ -91,12 +95,13 @@ def resize_intrinsics(K: Tensor, *, old_size: tuple[int, int], new_size: tuple[i
     check_image_size(old_size)
     check_image_size(new_size)
     sx, sy = new_size[1] / old_size[1], new_size[0] / old_size[0]
-    change = [[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]
-    return torch.tensor(change, device=K.device, dtype=K.dtype) @ K
+    # Row by row: a matrix of these numbers would be copied to the device and waited for.
+    x, y, last = K.unbind(dim=-2)
+    return torch.stack([sx * x + (sx - 1) / 2 * last, sy * y + (sy - 1) / 2 * last, last], dim=-2)
 
 
 def crop_intrinsics(K: Tensor, *, left: float, top: float) -> Tensor:
     """Intrinsics ``(*B, 3, 3)`` of the image whose pixel (0, 0) was (left, top)."""
     check_shapes(K=(K, "3 3"))
-    change = [[1, 0, -left], [0, 1, -top], [0, 0, 1]]
-    return torch.tensor(change, device=K.device, dtype=K.dtype) @ K
+    x, y, last = K.unbind(dim=-2)
+    return torch.stack([x - left * last, y - top * last, last], dim=-2)

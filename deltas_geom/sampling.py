@@ -74,7 +74,8 @@ def sample_segments(
         moving = length > 0
         unit = along * torch.where(moving, length, 1.0).rsqrt()
         across = torch.stack([-unit[..., 1], unit[..., 0]], dim=-1)
-        shifts = torch.tensor(offsets, device=start.device, dtype=start.dtype)
+        # Not torch.tensor, which copies numbers of the host to the device and waits for them.
+        shifts = torch.stack([start.new_full((), offset) for offset in offsets])
         pixels = pixels + shifts[:, None, None] * across[..., None, None, :]
     mask = segments.visible[..., None, None].expand(pixels.shape[:-1])
     if image_size is not None:

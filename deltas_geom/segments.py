@@ -170,11 +170,17 @@ def epipolar_segments(
     near, far = depth_range
     height, width = image_size
     origin, slope = rays.origin, rays.slope.expand_as(rays.origin)
-    # Each row asks origin·row + w slope·row >= 0: in front, left, right, top, bottom.
-    rows = origin.new_tensor(
-        [[0, 0, 1], [1, 0, 0.5], [-1, 0, width - 0.5], [0, 1, 0.5], [0, -1, height - 0.5]]
-    )
-    constant, growth = origin @ rows.mT, slope @ rows.mT
+
+    def margins(homogeneous: Tensor) -> Tensor:
+        """``(..., 5)`` from what a pixel must not leave: in front, left, right, top, bottom."""
+        x, y, z = homogeneous.unbind(dim=-1)
+        # Not by a matrix, whose numbers would be copied to the device and waited for.
+        left, right = x + 0.5 * z, (width - 0.5) * z - x
+        top, bottom = y + 0.5 * z, (height - 0.5) * z - y
+        return torch.stack([z, left, right, top, bottom], dim=-1)
+
+    # Each asks constant + w growth >= 0 of the inverse depth w.
+    constant, growth = margins(origin), margins(slope)
     # In front by more than rounding, so that the division by depth below is safe.
     depth, other = constant[..., :1] - rays.clearance[..., None], constant[..., 1:]
     constant = torch.cat([depth, other], dim=-1)

@@ -197,8 +197,9 @@ def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetr
 
 def unpacked3(entries: Symmetric3) -> Tensor:
     """Symmetric matrices ``(*B, N, 3, 3)`` from six ``(*B, N)``."""
-    packed = torch.stack(entries, dim=-1)
-    return packed[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    xx, xy, xz, yy, yz, zz = entries
+    # Not an index, which is copied to the device and waited for.
+    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(*xx.shape, 3, 3)
 
 
 def _of_poses(

@@ -52,8 +52,8 @@ class PosedViews(NamedTuple):
 
         Blender, NeRF's ``transforms.json`` and ARKit write these. The world stays as it is.
         """
-        flip = torch.tensor([1.0, -1, -1, 1], device=K.device, dtype=world_from_cam.dtype)
-        return cls(K, invert_pose(world_from_cam * flip))
+        x, y, z, center = world_from_cam.unbind(dim=-1)
+        return cls(K, invert_pose(torch.stack([x, -y, -z, center], dim=-1)))
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera, *, num_views: int | None = None) -> Self:
@@ -81,7 +81,8 @@ class PosedViews(NamedTuple):
     def select(self, index: int | slice | list[int]) -> Self:
         """The chosen views; an int keeps the view dim (V = 1)."""
         if isinstance(index, int):
-            index = [index]
+            # Not a list, which is copied to the device and waited for.
+            return type(self)(*(tensor.select(-3, index).unsqueeze(-3) for tensor in self))
         return self._replace(
             K=self.K[..., index, :, :], cam_from_world=self.cam_from_world[..., index, :, :]
         )

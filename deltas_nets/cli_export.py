@@ -34,6 +34,8 @@ class Export:
     """Of the images."""
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
+    refinement: int = 4
+    """Depths searched per sample, at most: wide baselines need up to 8, which takes longer."""
     overwrite: Flag = False
     """Replace --out if it exists."""
     debug: Flag = False
@@ -53,7 +55,9 @@ class Export:
         if self.out.exists() and not self.overwrite:
             raise UserError("the file exists", self.out, "add --overwrite or name another")
         try:
-            config = ExportConfig(self.views, self.points, self.size, self.depth_range)
+            config = ExportConfig(
+                self.views, self.points, self.size, self.depth_range, self.refinement
+            )
         except ValueError as error:
             raise UserError(str(error), "command line", "see deltas export --help") from None
         check_writable(self.out.parent)

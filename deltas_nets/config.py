@@ -51,7 +51,12 @@ class MatcherConfig:
     """Samples along a segment (the paper: 100)."""
     offsets: tuple[float, ...] = (-1.0, 0.0, 1.0)
     """per_view: parallel lines searched besides the epipolar line, pixels."""
-    context_rounds: int = 2
+    step: float = 1.5
+    """joint: depths are searched at most this far apart in the widest view, pixels; a sample is
+    subdivided until they are."""
+    max_refinement: int = 8
+    """joint: a sample is subdivided into at most this many."""
+    context_rounds: int = 3
     """joint: rounds in which points exchange evidence before they decide; 0 is none."""
     context_heads: int = 4
     """joint: attention heads in each round."""
@@ -63,6 +68,10 @@ class MatcherConfig:
     def __post_init__(self) -> None:
         if self.num_samples < 8:
             raise ValueError(f"num_samples must be at least 8, got {self.num_samples}")
+        if not self.step > 0:
+            raise ValueError(f"step must be positive, got {self.step}")
+        if self.max_refinement < 1:
+            raise ValueError(f"max_refinement must be at least 1, got {self.max_refinement}")
 
 
 @dataclass(frozen=True)
@@ -76,8 +85,9 @@ class NetworkConfig:
     """Image encoder: lite is EfficientNet-Lite0; the others are the paper's and bring its heads and
     densifier."""
     descriptor_dim: int = 48
-    """Channels of the descriptors, which are at 1/2 of the image's resolution (the paper: 128 at
-    1/8)."""
+    """Channels of the descriptors (the paper: 128)."""
+    descriptor_stride: Literal[2, 4] = 2
+    """lite: descriptors at 1/2 or 1/4 of the image's resolution (the paper: 1/8)."""
     head_width: int = 256
     """Channels inside the paper's detector and descriptor heads; lite has its own."""
     densifier_widths: tuple[int, ...] = (32, 48, 64, 96)
@@ -93,6 +103,8 @@ class NetworkConfig:
             )
         if self.backbone != "lite" and self.matcher.kind == "joint":
             raise ValueError(f"the joint matcher needs the lite backbone, got {self.backbone}")
+        if self.backbone != "lite" and self.descriptor_stride != 2:
+            raise ValueError(f"descriptor_stride is of the lite backbone, got {self.backbone}")
 
 
 @dataclass(frozen=True)
@@ -145,11 +157,21 @@ class DataConfig:
     it they are rendered or read each time."""
     workers: int = 1
     """Processes that read or render ahead; 0 does it in the training process."""
+    replay: int = 1
+    """Steps in which a room that was rendered or read is used on average, with other anchors and
+    sources, in another light: for processors that learn faster than rooms are rendered."""
+    shelf: int = 1
+    """Rooms that each place of a step keeps in the memory of the device, to take one at random;
+    about as many as --data.replay or more."""
     scannet: Annotated[ScanNetConfig, tyro.conf.arg(name="")] = field(default_factory=ScanNetConfig)
 
     def __post_init__(self) -> None:
         if self.source == "rooms" and self.scannet != ScanNetConfig():
             raise ValueError("--root and the other options of ScanNet need --data scannet")
+        if self.replay < 1 or self.shelf < 1:
+            raise ValueError(
+                f"replay and shelf must be at least 1, got {self.replay} and {self.shelf}"
+            )
 
 
 @dataclass(frozen=True)
@@ -197,7 +219,8 @@ class TrainConfig:
     """Whose interest points the detector learns to find (the paper: SuperPoint's), with weights
     from --teacher-weights; Shi-Tomasi corners without one."""
     pose_noise: tuple[float, float] = (0.004, 0.0015)
-    """Standard deviation of the sources' pose errors: metres, radians."""
+    """Standard deviation of the sources' pose errors, metres and radians, for a common tracker:
+    each room's has a quarter to twice as much."""
     clip_gradient: float = 5.0
     """Largest norm of the gradient."""
     average: float = 0.995
@@ -221,6 +244,11 @@ class TrainConfig:
             raise ValueError(
                 f"batch_size must be a multiple of accumulate, got {self.batch_size} and "
                 f"{self.accumulate}"
+            )
+        if self.batch_size % self.data.replay:
+            raise ValueError(
+                f"batch_size must be a multiple of data.replay, got {self.batch_size} and "
+                f"{self.data.replay}"
             )
         if not self.sizes or min(map(min, self.sizes)) < 32:
             raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {self.sizes}")

@@ -148,8 +148,8 @@ def depth_terms(
 ) -> tuple[Tensor, Tensor]:
     """Smooth L1 of log depth over four scales (paper: L_d), and L1 of its gradient.
 
-    The finest scale is compared at the image's own resolution, coarser ones with the mean of
-    the log depth in their cells.
+    The first scale has the image's resolution; the others are compared with the mean of the log
+    depth in their cells.
     """
     known = _known(depth, depth_range)
     truth = torch.where(known, depth, 1.0).log()
@@ -157,7 +157,6 @@ def depth_terms(
     for scale, predicted in enumerate(dense.log_depth):
         if scale == 0:
             goal, mask = truth, known
-            predicted = upsample_like(predicted, truth)
         else:
             size = (predicted.shape[-2], predicted.shape[-1])
             share = F.adaptive_avg_pool2d(known.float(), size)
@@ -235,7 +234,7 @@ def spread_loss(
     """
     known = _known(depth, depth_range)
     truth = torch.where(known, depth, 1.0).log()
-    error = (upsample_like(dense.log_depth[0], truth) - truth).abs().detach()
+    error = (dense.log_depth[0] - truth).abs().detach()
     log_spread = upsample_like(dense.log_spread, truth)
     return masked_mean(error * (-log_spread).exp() + log_spread, known, counts)
 

@@ -100,6 +100,26 @@ def load_weights(model: torch.nn.Module, file: Path) -> None:
     with safe_open(str(file), framework="pt") as opened:
         names = opened.keys()
         state: dict[str, Tensor] = {name: opened.get_tensor(name) for name in names}
+    _load(model, state, file)
+
+
+def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
+    """Copy a file's weights into a model that may have grown since; training goes on from there.
+
+    Returns:
+        Weights that the file lacks: they stay as they are.
+
+    Raises:
+        UserError: a weight is left over or of another shape.
+    """
+    with safe_open(str(file), framework="pt") as opened:
+        state = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    grown = {name: value for name, value in model.state_dict().items() if name not in state}
+    _load(model, {**grown, **state}, file)
+    return list(grown)
+
+
+def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
     try:
         model.load_state_dict(state)
     except RuntimeError as error:

@@ -18,7 +18,7 @@ PARTS = {
         "detector_head",
         "descriptor_head",
     ),
-    "matching and triangulation": ("matcher", "match_norm", GEOMETRY),
+    "matching and triangulation": ("matcher", "match_norm", "judge", GEOMETRY),
     "sparse to dense": ("densifier",),
 }
 """The paper's parts of a network, and the stages that are in each, in any of our networks."""

@@ -1,5 +1,8 @@
 """From rooms as rendered, or frames as read, to what a training step sees."""
 
+from collections.abc import Iterable
+from typing import Any, cast
+
 import torch
 import torch.nn.functional as F
 from kornia.augmentation import (
@@ -19,11 +22,14 @@ from deltas_geom import PosedViews
 from deltas_nets.data.posed_images import PosedImages
 
 
-def choose_views(batch: PosedImages, num_views: int, generator: torch.Generator) -> PosedImages:
-    """A random anchor and sources of every room: ``(B, num_views, ...)``."""
-    count, available = batch.depth.shape[:2]
-    order = torch.rand(count, available, generator=generator).argsort(dim=1)[:, :num_views]
-    row = torch.arange(count)[:, None]
+def choose_views(batch: PosedImages, order: Tensor) -> PosedImages:
+    """The anchor and the sources of every room.
+
+    Args:
+        batch: ``(B, V, ...)``.
+        order: ``(B, W)`` int64, which of the V views; the first becomes the anchor.
+    """
+    row = torch.arange(len(order), device=order.device)[:, None]
     views = PosedViews(batch.views.K[row, order], batch.views.cam_from_world[row, order])
     return PosedImages(batch.images[row, order], views, batch.depth[row, order])
 
@@ -44,7 +50,8 @@ def mirror(batch: PosedImages, flips: Tensor) -> PosedImages:
     width = batch.images.shape[-1]
     K = batch.views.K.clone()
     K[..., 0, 2] = width - 1 - K[..., 0, 2]
-    reflect = torch.diag(torch.tensor([-1.0, 1, 1, 1], device=K.device))
+    reflect = torch.eye(4, device=K.device)
+    reflect[0, 0] = -1
     mirrored = PosedImages(
         batch.images.flip(-1),
         PosedViews(K, reflect @ batch.views.cam_from_world @ reflect),
@@ -88,30 +95,61 @@ class Photometry(nn.Module):
             RandomJPEG(jpeg_quality=(40.0, 95.0), p=0.3),
         )
 
-    def forward(self, images: Tensor, seed: int) -> Tensor:
-        """Augment ``(B, V, 3, H, W)`` in [0, 1]; the same seed does the same."""
-        # kornia draws from torch's global generator; it is put back afterwards.
-        with torch.random.fork_rng(devices=[]):
+    def forward(
+        self, images: Tensor, seed: int, *, first: int = 0, places: int | None = None
+    ) -> Tensor:
+        """Augment ``(B, V, 3, H, W)`` in [0, 1]; the same seed does the same.
+
+        Args:
+            images: of B rooms.
+            seed: of the whole step.
+            first: place of the first of these rooms in the step.
+            places: rooms of the whole step, B if not given. What happens to a room depends on
+                its place, not on which others are here.
+        """
+        batch, views = images.shape[:2]
+        whole = ((batch if places is None else places) * views, *images.shape[2:])
+        rows = slice(first * views, (first + batch) * views)
+        changed = images.flatten(0, 1)
+        # kornia draws from torch's global generators; they are put back afterwards.
+        on_gpu = [images.device] if images.is_cuda else []
+        with torch.random.fork_rng(devices=on_gpu):
             torch.manual_seed(seed)
-            changed: Tensor = self.steps(images.flatten(0, 1))
+            for step in cast(Iterable[Any], self.steps):
+                step.set_rng_device_and_dtype(images.device, images.dtype)
+                drawn = step.forward_parameters(whole)
+                changed = step(changed, params={k: _own(k, v, rows) for k, v in drawn.items()})
         return changed.clamp(0, 1).reshape(images.shape)
 
 
-def disturb_poses(
-    views: PosedViews, noise: tuple[float, float], generator: torch.Generator
-) -> PosedViews:
-    """Tracking errors of the sources, as real poses have them.
+def _own(name: str, drawn: Tensor, rows: slice) -> Tensor:
+    """The rows of some images in what kornia drew for all."""
+    if name == "forward_input_shape":
+        return drawn
+    if name == "idx":  # whose blur has the size that all have
+        return torch.zeros_like(drawn)
+    return drawn[rows]
+
+
+def draw_pose_errors(
+    num_views: int, noise: tuple[float, float], generator: torch.Generator
+) -> Tensor:
+    """Tracking errors of a room's views: motions ``(V, 4, 4)``, the first one none.
 
     Args:
-        views: ``(B, V)``.
+        num_views: V.
         noise: standard deviations of translation (metres) and rotation (radians), per axis.
         generator: source of randomness.
     """
-    batch, count = views.K.shape[:2]
-    shift = noise[0] * torch.randn(batch, count, 3, generator=generator)
-    turn = noise[1] * torch.randn(batch * count, 3, generator=generator)
-    error = torch.eye(4).repeat(batch, count, 1, 1)
-    error[..., :3, :3] = axis_angle_to_rotation_matrix(turn).unflatten(0, (batch, count))
-    error[..., :3, 3] = shift
-    error[:, 0] = torch.eye(4)  # the anchor defines the frame
-    return views._replace(cam_from_world=error.to(views.K.device) @ views.cam_from_world)
+    shift = noise[0] * torch.randn(num_views, 3, generator=generator)
+    turn = noise[1] * torch.randn(num_views, 3, generator=generator)
+    error = torch.eye(4).repeat(num_views, 1, 1)
+    error[:, :3, :3] = axis_angle_to_rotation_matrix(turn)
+    error[:, :3, 3] = shift
+    error[0] = torch.eye(4)  # the anchor defines the frame
+    return error
+
+
+def disturb_poses(views: PosedViews, errors: Tensor) -> PosedViews:
+    """Views ``(B, V)`` whose poses are off by ``errors``, ``(B, V, 4, 4)`` motions."""
+    return views._replace(cam_from_world=errors.to(views.K) @ views.cam_from_world)

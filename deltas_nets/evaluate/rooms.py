@@ -9,7 +9,7 @@ from torch.utils.data import Dataset
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.augment import Photometry, disturb_poses
+from deltas_nets.data.augment import Photometry, disturb_poses, draw_pose_errors
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.evaluate.calibration import CalibrationMeter
@@ -55,8 +55,7 @@ class DisturbedRooms(Dataset[PosedImages]):
         images = self.photometry(room.images[None].float() / 255, seed)[0]
         views = disturb_poses(
             PosedViews(*(tensor[None] for tensor in room.views)),
-            self.pose_noise,
-            torch.Generator().manual_seed(seed),
+            draw_pose_errors(len(room.depth), self.pose_noise, torch.Generator().manual_seed(seed)),
         )
         views = PosedViews(*(tensor[0] for tensor in views))
         return PosedImages((images * 255).round().to(torch.uint8), views, room.depth)

@@ -34,6 +34,9 @@ class ExportConfig:
     """(height, width) of the images, pixels."""
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
+    refinement: int = 4
+    """Samples per bin of inverse depth, at most. The network takes as many as the widest view
+    needs, up to its config's max_refinement; a file takes the time of these always."""
 
     def __post_init__(self) -> None:
         if self.num_views < 2:
@@ -42,6 +45,8 @@ class ExportConfig:
             raise ValueError(f"there must be 8 points or more, got {self.num_points}")
         if min(self.image_size) < 32:
             raise ValueError(f"images must be 32 x 32 pixels or more, got {self.image_size}")
+        if self.refinement < 1:
+            raise ValueError(f"refinement must be at least 1, got {self.refinement}")
         check_depth_range(self.depth_range)
 
 
@@ -75,6 +80,7 @@ class FixedDeltas(nn.Module):
             PosedViews(K, cam_from_world),
             self.config.depth_range,
             num_keypoints=self.config.num_points,
+            refinement=self.config.refinement,
         )
         return {
             "depth": prediction.depth,

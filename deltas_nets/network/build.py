@@ -1,4 +1,4 @@
-"""From a config to the five stages of a network."""
+"""From a config to the stages of a network."""
 
 from typing import NamedTuple
 
@@ -7,6 +7,7 @@ from deltas_nets.network.densifier import Densifier
 from deltas_nets.network.descriptor import Descriptor
 from deltas_nets.network.detector import Detector
 from deltas_nets.network.encoder import Encoder
+from deltas_nets.network.judge import Judge
 from deltas_nets.network.matcher import Matcher, build_matcher
 from deltas_nets.network.paper import (
     PaperDensifier,
@@ -20,12 +21,16 @@ from deltas_nets.network.vgg import VGG9
 
 
 class Stages(NamedTuple):
-    """What :class:`deltas_nets.network.deltas.Deltas` composes, in order."""
+    """What :class:`deltas_nets.network.deltas.Deltas` composes, in order.
+
+    Only the joint matcher has a judge.
+    """
 
     encoder: Encoder | PaperEncoder
     detector: Detector | PaperDetector
     descriptor: Descriptor | PaperDescriptor
     matcher: Matcher
+    judge: Judge | None
     densifier: Densifier | PaperDensifier
 
 
@@ -36,8 +41,9 @@ def build_stages(config: NetworkConfig) -> Stages:
         return Stages(
             Encoder(),
             Detector(config.detector),
-            Descriptor(config.descriptor_dim),
+            Descriptor(config.descriptor_dim, config.descriptor_stride),
             matcher,
+            Judge(config.matcher.window) if config.matcher.kind == "joint" else None,
             Densifier(_four(config.densifier_widths)),
         )
     backbones: dict[str, type[Backbone]] = {"resnet50": ResNet50, "vgg9": VGG9}
@@ -48,6 +54,7 @@ def build_stages(config: NetworkConfig) -> Stages:
         PaperDetector(config.detector, image.channels, config.head_width),
         PaperDescriptor(image.channels, config.descriptor_dim, config.head_width),
         matcher,
+        None,  # a point's confidence is its matches' weight
         PaperDensifier(sparse, image.channels, _five(config.densifier_widths)),
     )
 

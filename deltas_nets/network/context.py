@@ -6,14 +6,29 @@ and multiplies its own evidence by theirs.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from deltas_nets.network.layers import zero_initialised
 
+WIDTH = 64
+"""Channels of a point's embedding."""
 # A neighbour's posterior never rules out a depth altogether.
 _FLOOR = 3e-3
+
+
+class Exchanged(NamedTuple):
+    """What points believe after the exchange.
+
+    Attributes:
+        stages: logits ``(B, N, S)`` after each round, the given ones first.
+        embedding: ``(B, N, 64)`` of the points, by which they chose whom to listen to.
+    """
+
+    stages: list[Tensor]
+    embedding: Tensor
 
 
 class Context(nn.Module):
@@ -21,11 +36,16 @@ class Context(nn.Module):
 
     def __init__(self, feature_dim: int, *, rounds: int, heads: int) -> None:
         super().__init__()
-        self.embed = nn.Sequential(nn.Linear(feature_dim + 4, 64), nn.ReLU(), nn.Linear(64, 64))
-        self.rounds = nn.ModuleList([_Round(64, heads) for _ in range(rounds)])
+        self.embed = nn.Sequential(
+            nn.Linear(feature_dim + 4, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH)
+        )
+        # Two rounds listen from the start. Further ones begin as the identity, so that weights from
+        # before there were any give the depth they were trained for.
+        gains = [0.7 / heads if number < 2 else 0.0 for number in range(rounds)]
+        self.rounds = nn.ModuleList([_Round(WIDTH, heads, gain) for gain in gains])
 
-    def forward(self, logits: Tensor, features: Tensor, positions: Tensor) -> list[Tensor]:
-        """Logits after each round, the given ones first.
+    def forward(self, logits: Tensor, features: Tensor, positions: Tensor) -> Exchanged:
+        """Logits after each round, and what the points are to each other.
 
         Args:
             logits: ``(B, N, S)`` over inverse depth.
@@ -41,11 +61,11 @@ class Context(nn.Module):
         stages = [logits]
         for exchange in self.rounds:
             stages.append(exchange(stages[-1], points, squared))
-        return stages
+        return Exchanged(stages, points)
 
 
 class _Round(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, gain: float) -> None:
         super().__init__()
         self.heads = heads
         self.query = nn.Linear(width, 16 * heads)
@@ -53,7 +73,7 @@ class _Round(nn.Module):
         self.trust = nn.Linear(width, heads)
         # Attention falls off with distance; the heads start from near to far.
         self.log_reach = nn.Parameter(torch.linspace(-2.5, -0.7, heads))
-        self.gain = nn.Parameter(torch.full((heads,), 0.7 / heads))
+        self.gain = nn.Parameter(torch.full((heads,), gain))
         self.mix = smooth_scores(1 + heads)
 
     def forward(self, logits: Tensor, points: Tensor, squared: Tensor) -> Tensor:

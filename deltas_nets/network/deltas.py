@@ -23,6 +23,7 @@ from deltas_nets.network.detector import Keypoints
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.matcher import Posterior
+from deltas_nets.network.parallax import parallax_of, relative_error_per_pixel
 
 
 class Evidence(NamedTuple):
@@ -91,6 +92,7 @@ class Deltas(nn.Module):
         self.detector = stages.detector
         self.descriptor = stages.descriptor
         self.matcher = stages.matcher
+        self.judge = stages.judge
         self.densifier = stages.densifier
 
     @property
@@ -106,6 +108,7 @@ class Deltas(nn.Module):
         *,
         num_keypoints: int | None = None,
         shift: Tensor | None = None,
+        refinement: int | None = None,
     ) -> DepthPrediction:
         """Predict the depth of view 0.
 
@@ -115,14 +118,19 @@ class Deltas(nn.Module):
             depth_range: (near, far) of the search, metres.
             num_keypoints: instead of the config's.
             shift: ``(*B, 2)`` moves the spread keypoints, for variety in training.
+            refinement: room for this many samples in each bin of inverse depth, whatever the
+                cameras, where shapes must not follow from values. Without it there are as many as
+                the widest view needs.
 
         Raises:
             ShapeError: a trailing shape differs, or there is no source.
-            ValueError: the depth range makes no sense.
+            ValueError: the depth range makes no sense, or the refinement is not positive.
             TypeError: the images are integers.
         """
         check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
         check_depth_range(depth_range)
+        if refinement is not None and refinement < 1:
+            raise ValueError(f"refinement must be at least 1, got {refinement}")
         if not images.is_floating_point():
             raise TypeError(f"images must be floating point in [0, 1], got {images.dtype}")
         if images.shape[-4] < 2:
@@ -138,6 +146,7 @@ class Deltas(nn.Module):
             image_size=size,
             num_keypoints=num_keypoints,
             shift=None if shift is None else shift.reshape(-1, 2),
+            refinement=refinement,
         )
         return with_batch_dims(prediction, batch)
 
@@ -159,6 +168,7 @@ class Deltas(nn.Module):
         image_size: tuple[int, int],
         num_keypoints: int | None = None,
         shift: Tensor | None = None,
+        refinement: int | None = None,
     ) -> DepthPrediction:
         """Predict the depth of view 0 of encoded images.
 
@@ -169,6 +179,7 @@ class Deltas(nn.Module):
             image_size: (height, width) of the images.
             num_keypoints: instead of the config's.
             shift: ``(B, 2)`` as for :meth:`forward`.
+            refinement: as for :meth:`forward`.
         """
         features, descriptors = encoded
         keypoints = self.detector(
@@ -182,22 +193,29 @@ class Deltas(nn.Module):
                 views,
                 image_size=image_size,
                 depth_range=depth_range,
+                refinement=refinement,
             )
-            matches = matched.matches
+            matches, posterior, confidence = matched.matches, matched.posterior, matched.confidence
             points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
+            if self.judge is not None and matched.decision is not None:
+                confidence = self.judge(matched.decision, matches, posterior, points, views)
             depth = points.depth[:, 0]
             near, far = 0.5 * depth_range[0], 2 * depth_range[1]
-            sparse = rasterize_depth(
-                keypoints.pixels,
-                depth,
-                image_size=image_size,
-                mask=points.valid & (depth > near) & (depth < far),
-                weights=matched.confidence,
-                reduce="mean",
+            parallax = parallax_of(views, points, matches.mask[:, 1:])
+            sparse, doubt = (
+                rasterize_depth(
+                    keypoints.pixels,
+                    values,
+                    image_size=image_size,
+                    mask=points.valid & (depth > near) & (depth < far),
+                    weights=confidence,
+                    reduce="mean",
+                )
+                for values in (depth, relative_error_per_pixel(views, parallax))
             )
-        dense = self.densifier(features, sparse)
+        dense = self.densifier(features, sparse, doubt)
 
-        full = upsample_to(dense.log_depth[0], image_size).exp()
+        full = dense.log_depth[0].exp()
         # A Laplace distribution deviates by sqrt(2) of its scale.
         log_std = upsample_to(dense.log_spread, image_size) + 0.5 * math.log(2)
         return DepthPrediction(
@@ -207,7 +225,7 @@ class Deltas(nn.Module):
             matches=matches,
             points=points,
             sparse=sparse,
-            evidence=Evidence(matched.confidence, matched.posterior, dense),
+            evidence=Evidence(confidence, posterior, dense),
         )
 
 

@@ -1,7 +1,8 @@
 """From sparse depth to a dense map with its own uncertainty.
 
 The sparse depth is interpolated without parameters (pull-push), and a small U-Net on the
-anchor's features corrects it at four scales. Working on log depth makes every error relative.
+anchor's features corrects it at four scales; the finest of them, at half resolution, is upsampled
+to the image's. Working on log depth makes every error relative.
 """
 
 import math
@@ -13,20 +14,19 @@ from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
 from deltas_nets.network.calibration import SpreadCalibration
+from deltas_nets.network.convex_upsampling import ConvexUpsampling, convex_upsample
 from deltas_nets.network.encoder import CHANNELS, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
-
-SCALES = 4
-"""Scales at which depth is predicted: 1/2, 1/4, 1/8, 1/16."""
 
 
 class DenseDepth(NamedTuple):
     """Dense depth of the anchor.
 
     Attributes:
-        log_depth: four ``(B, 1, h, w)``, each half as large as the one before, the finest at the
-            image's or half its resolution; log metres.
-        log_spread: ``(B, 1, H/2, W/2)`` log of the Laplace scale of the error of log depth.
+        log_depth: four ``(B, 1, h, w)`` in log metres: the first at the image's resolution, the
+            others at 1/4, 1/8, 1/16 (the paper's: 1/2, 1/4, 1/8).
+        log_spread: ``(B, 1, H, W)`` log of the Laplace scale of the error of log depth (the
+            paper's: at half that resolution).
     """
 
     log_depth: tuple[Tensor, ...]
@@ -122,12 +122,30 @@ class Densifier(nn.Module):
         )
         self.spread = nn.Conv2d(half, 1, 3, padding=1)
         self.calibration = SpreadCalibration()
+        self.upsampling = ConvexUpsampling(half)
+        # How well the views tell depth here, for the depth and for its spread: no change at first.
+        self.enter_doubt = zero_initialised(nn.Conv2d(1, half, 3, padding=1))
+        self.spread_doubt = nn.Sequential(
+            ConvBlock(half + 6, half), zero_initialised(nn.Conv2d(half, 1, 3, padding=1))
+        )
 
-    def forward(self, features: Features, sparse: SparseDepth) -> DenseDepth:
-        """Densify ``(B, 1, H, W)`` sparse depth of the anchor."""
+    def forward(self, features: Features, sparse: SparseDepth, doubt: SparseDepth) -> DenseDepth:
+        """Densify sparse depth of the anchor.
+
+        Depth is predicted at 1/2, 1/4, 1/8 and 1/16; that at 1/2 is given, and supervised, as
+        upsampled to the image.
+
+        Args:
+            features: of all views.
+            sparse: ``(B, 1, H, W)`` depth of the points.
+            doubt: ``(B, 1, H, W)`` in its place the relative error of depth that one pixel gives.
+        """
         anchor = features.of_anchor()
         known = interpolate_sparse(sparse)
-        x4 = self.down4(torch.cat([self.enter(torch.cat(known, dim=1)), anchor.quarter], dim=1))
+        # Most are between e^-6 and e^-2.
+        doubtful = interpolate_sparse(doubt, fallback=0.02).log_depth / 2 + 2
+        entered = self.enter(torch.cat(known, dim=1)) + self.enter_doubt(doubtful)
+        x4 = self.down4(torch.cat([entered, anchor.quarter], dim=1))
         x8 = self.join8(torch.cat([self.down8(x4), anchor.eighth], dim=1))
         x16 = self.join16(torch.cat([self.down16(x8), anchor.sixteenth], dim=1))
         y8 = self.up8(torch.cat([upsample_like(x16, x8), x8], dim=1))
@@ -142,8 +160,17 @@ class Densifier(nn.Module):
         y2 = self.up2(
             torch.cat([upsample_like(y4, anchor.half), anchor.half, anchor.fine, base], dim=1)
         )
-        depths.append(base + self.correct[0](y2).float())
-        return DenseDepth(tuple(reversed(depths)), self.spread(y2).float().clamp(-6, 2))
+        half = base + self.correct[0](y2).float()
+        clues = upsample_like(torch.cat([*known, doubtful], dim=1), y2)
+        correction = self.spread_doubt(torch.cat([y2, clues], dim=1))
+        log_spread = (self.spread(y2) + correction).float().clamp(-6, 2)
+        logits = self.upsampling(y2)
+        # The last cell of an odd side reaches beyond the image.
+        height, width = sparse.depth.shape[-2:]
+        depths.append(convex_upsample(half, logits)[..., :height, :width])
+        # Doubt follows the edges of depth and must not move them.
+        log_spread = convex_upsample(log_spread, logits.detach())[..., :height, :width]
+        return DenseDepth(tuple(reversed(depths)), log_spread)
 
 
 def _pooled_like(fine: Tensor, coarse: Tensor) -> Tensor:

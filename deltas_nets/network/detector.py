@@ -119,10 +119,15 @@ def choose_keypoints(
         shift: ``(B, 2)`` in [0, 1): moves the spread points.
     """
     count = num_keypoints or config.num_keypoints
-    spread = spread_points(count, image_size=image_size).to(logits.device)
+    device, (height, width) = logits.device, image_size
+    # CUDA has read so small a table when the call returns, and is not waited for; other devices
+    # may read it later.
+    spread = spread_points(count, image_size=image_size)
+    spread = spread.to(device, non_blocking=device.type == "cuda")
     if shift is None:
-        shift = torch.zeros(len(logits), 2, device=logits.device)
-    size = torch.tensor(image_size[::-1], device=logits.device)
+        shift = torch.zeros(len(logits), 2, device=device)
+    # Not torch.tensor, which copies numbers of the host to the device and waits for them.
+    size = torch.linspace(width, height, 2, device=device)
     pixels = (spread + (shift[:, None] * size).floor()).remainder(size)
     best, scores = _best(detector_heatmap(logits.detach(), image_size=image_size), config, count)
     detected = scores > config.threshold

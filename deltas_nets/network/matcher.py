@@ -26,6 +26,12 @@ from deltas_geom.matching import matches_at
 from deltas_nets.config import MatcherConfig
 from deltas_nets.network.context import Context, smooth_scores
 from deltas_nets.network.descriptor import WIDTH, Descriptors
+from deltas_nets.network.inverse_depths import (
+    best_of_bins,
+    bin_centres,
+    samples_per_bin,
+    subdivide,
+)
 from deltas_nets.network.refine import RefineMatches
 
 
@@ -43,6 +49,26 @@ class Posterior(NamedTuple):
     mask: Tensor
 
 
+class Decision(NamedTuple):
+    """How the joint matcher decided, for whoever judges it by what comes of it.
+
+    Attributes:
+        inv_depth: ``(B, N)`` decided, 1/m.
+        logit: ``(B, N)`` of the confidence where a source can see the point at some depth.
+        seen: ``(B, N)`` bool, whether one can.
+        evidence: ``(B, N, 4)`` what the logit rests on.
+        embedding: ``(B, N, 64)`` of the points among each other.
+        moved: ``(B, V-1, N)`` how far each source moved its match after the decision, px.
+    """
+
+    inv_depth: Tensor
+    logit: Tensor
+    seen: Tensor
+    evidence: Tensor
+    embedding: Tensor
+    moved: Tensor
+
+
 class Matched(NamedTuple):
     """What a matcher found.
 
@@ -50,11 +76,13 @@ class Matched(NamedTuple):
         matches: of all views, ready to triangulate.
         confidence: ``(B, N)`` probability that the depth is right.
         posterior: where it comes from.
+        decision: of the joint matcher; None where each view decides alone.
     """
 
     matches: Matches
     confidence: Tensor
     posterior: Posterior
+    decision: Decision | None
 
 
 class JointMatcher(nn.Module):
@@ -80,67 +108,75 @@ class JointMatcher(nn.Module):
         *,
         image_size: tuple[int, int],
         depth_range: tuple[float, float],
+        refinement: int | None = None,
     ) -> Matched:
-        """Match ``(B, N, 2)`` keypoints of the anchor in all sources at once."""
-        near, far = depth_range
-        inv_depths = torch.linspace(
-            1 / far, 1 / near, self.config.num_samples, device=keypoints.device
-        )
-        samples = sample_inv_depths(views, keypoints, inv_depths, image_size=image_size)
-        anchor = _at_keypoints(descriptors, keypoints, image_size)
-        correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
-        correlation, seen = correlation.squeeze(-2), samples.mask.squeeze(-2)
-        stages, fused = self._posterior(
-            correlation, seen, anchor, descriptors, keypoints, image_size
-        )
+        """Match ``(B, N, 2)`` keypoints of the anchor in all sources at once.
 
-        found = soft_argmax(stages[-1], inv_depths[:, None], window=self.config.window)
-        best = stages[-1].argmax(dim=-1, keepdim=True)
-        agreement = fused.gather(-1, best).squeeze(-1)
-        sources = seen.any(dim=-1).sum(dim=1) / 4
-        evidence = torch.stack([found.mass, agreement, found.entropy / 3, sources], dim=-1)
-        confidence = self.confidence(evidence).squeeze(-1).sigmoid()
-        confidence = torch.where(seen.any(dim=-1).any(dim=1), confidence, 0.0)
-
-        matches = matches_at(
+        Without a ``refinement`` the number of samples is read from the device.
+        """
+        config = self.config
+        most = min(refinement or config.max_refinement, config.max_refinement)
+        centres = bin_centres(config.num_samples, depth_range, like=keypoints)
+        counts = samples_per_bin(
             views,
             keypoints,
-            found.position.squeeze(-1).clamp(min=1 / far),
-            found.covariance[..., 0, 0],
-            weights=torch.ones_like(confidence),
+            centres,
+            step=config.step,
+            most=most,
             image_size=image_size,
         )
-        matches = self.refine(matches, anchor, descriptors.maps, image_size=image_size)
-        posterior = Posterior(
-            tuple(stage.unsqueeze(1) for stage in stages), inv_depths, seen.any(1, keepdim=True)
-        )
-        return Matched(matches, confidence, posterior)
-
-    def _posterior(
-        self,
-        correlation: Tensor,
-        seen: Tensor,
-        anchor: Tensor,
-        descriptors: Descriptors,
-        keypoints: Tensor,
-        image_size: tuple[int, int],
-    ) -> tuple[list[Tensor], Tensor]:
-        """Logits ``(B, N, S)`` of every stage, and the fused correlation."""
-        # Views that see the point agree with it better than those it is hidden from.
-        weight = seen * (self.visibility * correlation).exp()
-        total = weight.sum(dim=1)
-        fused = (weight * correlation).sum(dim=1) / total.clamp_min(1e-6)
-        fused = torch.where(seen.any(dim=1), fused, -0.2)
-        share = seen.float().mean(dim=1)
-        rows = torch.stack([fused, share], dim=2).flatten(0, 1)
-        fused = fused + self.smooth(rows).view_as(fused)
+        places = subdivide(centres, counts, most if refinement else int(counts.max()))
+        each = places.flatten(1)[:, None].expand(-1, keypoints.shape[1], -1)
+        samples = sample_inv_depths(views, keypoints, each, image_size=image_size)
+        anchor = _at_keypoints(descriptors, keypoints, image_size)
+        correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
+        seen = samples.mask.squeeze(-2)
+        bins = best_of_bins(*self._fused(correlation.squeeze(-2), seen), places, centres)
+        rows = torch.stack([bins.score, bins.share], dim=2).flatten(0, 1)
+        fused = bins.score + self.smooth(rows).view_as(bins.score)
         context = sample_map(descriptors.context[:, 0], keypoints, image_size=image_size)
-        stages = self.context(
+        stages, embedding = self.context(
             fused * self.log_scale.exp(),
             torch.cat([anchor, context], dim=-1),
             keypoints / image_size[1],
         )
-        return stages, fused
+
+        found = soft_argmax(stages[-1], bins.inv_depth[..., None], window=config.window)
+        best = stages[-1].argmax(dim=-1, keepdim=True)
+        agreement = fused.gather(-1, best).squeeze(-1)
+        sources = seen.any(dim=-1).sum(dim=1) / 4
+        evidence = torch.stack([found.mass, agreement, found.entropy / 3, sources], dim=-1)
+        logit = self.confidence(evidence).squeeze(-1)
+        inv_depth = found.position.squeeze(-1).clamp(min=1 / depth_range[1])
+        decided = matches_at(
+            views,
+            keypoints,
+            inv_depth,
+            found.covariance[..., 0, 0],
+            weights=torch.ones_like(logit),
+            image_size=image_size,
+        )
+        matches = self.refine(decided, anchor, descriptors.maps, image_size=image_size)
+        somewhere = sources > 0
+        moved = torch.linalg.vector_norm((matches.pixels - decided.pixels)[:, 1:].detach(), dim=-1)
+        return Matched(
+            matches,
+            torch.where(somewhere, logit.sigmoid(), 0.0),
+            Posterior(
+                tuple(stage.unsqueeze(1) for stage in stages),
+                centres,
+                (bins.share > 0).unsqueeze(1),
+            ),
+            Decision(inv_depth, logit, somewhere, evidence, embedding, moved),
+        )
+
+    def _fused(self, correlation: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Correlation of all sources as one, and the share of them that see it."""
+        # Views that see the point agree with it better than those it is hidden from.
+        weight = seen * (self.visibility * correlation).exp()
+        total = weight.sum(dim=1)
+        fused = (weight * correlation).sum(dim=1) / total.clamp_min(1e-6)
+        return torch.where(seen.any(dim=1), fused, -0.2), seen.float().mean(dim=1)
 
 
 class PerViewMatcher(nn.Module):
@@ -160,8 +196,12 @@ class PerViewMatcher(nn.Module):
         *,
         image_size: tuple[int, int],
         depth_range: tuple[float, float],
+        refinement: int | None = None,
     ) -> Matched:
-        """Match ``(B, N, 2)`` keypoints of the anchor in each source alone."""
+        """Match ``(B, N, 2)`` keypoints of the anchor in each source alone.
+
+        There is no ``refinement``: each source is searched where it can see the point.
+        """
         segments = epipolar_segments(
             views, keypoints, depth_range=depth_range, image_size=image_size
         )
@@ -178,7 +218,7 @@ class PerViewMatcher(nn.Module):
             (along.logsumexp(dim=-2),), samples.inv_depth, samples.mask.any(dim=-2)
         )
         confidence = torch.where(matches.mask, matches.weights, 0.0)[:, 1:].amax(dim=1)
-        return Matched(matches, confidence, posterior)
+        return Matched(matches, confidence, posterior, None)
 
 
 def _at_keypoints(

@@ -6,6 +6,7 @@ densifier joins all five with those of the sparse depth.
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -54,9 +55,9 @@ class Backbone(nn.Module):
 
 def imagenet_normalised(images: Tensor) -> Tensor:
     """RGB ``(..., 3, H, W)`` in [0, 1] by the mean and deviation of ImageNet."""
-    mean, std = images.new_tensor([IMAGENET_MEAN, IMAGENET_STD])
-    normalised: Tensor = (images - mean[:, None, None]) / std[:, None, None]
-    return normalised
+    # One by one: a tensor of the means would be copied to the device and waited for.
+    channels = zip(images.unbind(dim=-3), IMAGENET_MEAN, IMAGENET_STD, strict=True)
+    return torch.stack([(channel - mean) / std for channel, mean, std in channels], dim=-3)
 
 
 def initialise_convolutions(module: nn.Module) -> None:

@@ -117,8 +117,10 @@ class SuperPoint(nn.Module):
             return images
         if images.shape[1] != 3:
             raise ValueError(f"images must have 3 or {self.channels} channels: {images.shape}")
-        grey = (images * images.new_tensor(GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
-        return grey.expand(-1, self.channels, -1, -1)
+        # One by one: a tensor of the shares would be copied to the device and waited for.
+        channels = zip(images.unbind(dim=1), GREY, strict=True)
+        red, green, blue = (share * channel for channel, share in channels)
+        return (red + green + blue).unsqueeze(1).expand(-1, self.channels, -1, -1)
 
 
 def load_superpoint(file: Path) -> SuperPoint:

@@ -25,9 +25,11 @@ class RunningAverage:
     def update(self, model: nn.Module, step: int) -> None:
         """Take in the weights after a step, counted from 0."""
         keep = min(self.decay, (1 + step) / (10 + step))
-        current = model.state_dict()
+        current, averages, news = model.state_dict(), [], []
         for name, average in self.model.state_dict().items():
             if average.is_floating_point():
-                average.lerp_(current[name].to(average.dtype), 1 - keep)
+                averages.append(average)
+                news.append(current[name].to(average.dtype))
             else:
                 average.copy_(current[name])
+        torch._foreach_lerp_(averages, news, 1 - keep)  # one launch, not one a tensor

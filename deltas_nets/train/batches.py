@@ -3,7 +3,8 @@
 So a resumed run continues exactly, a step can be looked at without running those before, and
 several processes see together what one would: each takes its part of every step's rooms, and
 what is drawn for a room depends on its place in the step, not on who holds it. A tuple of
-ScanNet's frames counts as a room; reading it draws nothing.
+ScanNet's frames counts as a room; reading it draws nothing. Rooms come as they are on disk, are
+moved to the device that trains, and everything else happens there, to all of them at once.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ from deltas_nets.data.augment import (
     Photometry,
     choose_views,
     disturb_poses,
+    draw_pose_errors,
     first_views,
     mirror,
     resize,
@@ -29,6 +31,7 @@ from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.scannet_tuples import ScanNetTuples, open_scannet
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
+from deltas_nets.train.shelves import Shelves, places_with_new_rooms
 
 
 class Part(NamedTuple):
@@ -85,7 +88,18 @@ class Batch(NamedTuple):
 
 
 class StepSampler(Sampler[list[int]]):
-    """Rooms of the steps ``start .. stop``: every epoch a new order, the same for a seed."""
+    """New rooms of the steps ``start .. stop``: every epoch a new order, the same for a seed.
+
+    Args:
+        num_rooms: in an epoch.
+        batch_size: places in a step.
+        seed: of the orders.
+        start: first step. With ``replay`` > 1 it may be negative: what comes before step 0 gives
+            every place its first room.
+        stop: the step after the last.
+        part: whose places.
+        replay: a place gets a new room in every so many steps; its places take turns.
+    """
 
     def __init__(
         self,
@@ -96,22 +110,25 @@ class StepSampler(Sampler[list[int]]):
         start: int,
         stop: int,
         part: Part = ALL,
+        replay: int = 1,
     ) -> None:
         self.num_rooms = num_rooms
         self.batch_size = batch_size
         self.seed = seed
         self.steps = range(start, stop)
         self.part = part
+        self.replay = replay
 
     def __len__(self) -> int:
         return len(self.steps)
 
     def __iter__(self) -> Iterator[list[int]]:
         epoch, order = -1, torch.empty(0, dtype=torch.long)
+        per_step = self.batch_size // self.replay
         for step in self.steps:
             batch = []
-            for place in self.part.of(self.batch_size):
-                number = step * self.batch_size + place
+            for place in places_with_new_rooms(step, self.part.of(self.batch_size), self.replay):
+                number = (step + self.replay - 1) * per_step + place // self.replay
                 if number // self.num_rooms != epoch:
                     epoch = number // self.num_rooms
                     shuffle = torch.Generator().manual_seed(self.seed * 1_000_003 + epoch)
@@ -176,26 +193,52 @@ def _frames(
 
 
 def step_loader(
-    data: Rooms | ScanNetTuples, config: TrainConfig, *, start: int, stop: int, part: Part = ALL
+    data: Rooms | ScanNetTuples,
+    config: TrainConfig,
+    *,
+    start: int,
+    stop: int,
+    part: Part = ALL,
+    device: torch.device | str = "cpu",
 ) -> Iterator[PosedImages]:
-    """Rooms of the steps ``start .. stop``, read or rendered ahead by workers.
+    """Rooms of the steps ``start .. stop`` on a device, read or rendered ahead by workers.
 
     Raises:
         UserError: one of them cannot be read.
     """
+    places, replay = part.of(config.batch_size), config.data.replay
+    shelves = Shelves(places, config.data.shelf, replay, seed=config.seed)
+    first = shelves.first_step(start)
     sampler = StepSampler(
-        len(data), config.batch_size, seed=config.seed, start=start, stop=stop, part=part
+        len(data),
+        config.batch_size,
+        seed=config.seed,
+        start=first,
+        stop=stop,
+        part=part,
+        replay=replay,
     )
-    loader: DataLoader[PosedImages | UserError] = DataLoader(
+    loader: DataLoader[PosedImages | UserError | None] = DataLoader(
         _OrError(data),
         batch_sampler=sampler,
         num_workers=config.data.workers,
         collate_fn=_collate,
     )
-    for rooms in loader:
+    for step, rooms in enumerate(loader, first):
         if isinstance(rooms, UserError):
             raise rooms
-        yield rooms
+        if rooms is not None:
+            shelves.put(_to_device(rooms, device), step)
+        if step >= start:
+            yield shelves.take(step)
+
+
+def _to_device(rooms: PosedImages, device: torch.device | str) -> PosedImages:
+    return PosedImages(
+        rooms.images.to(device),
+        PosedViews(*(tensor.to(device) for tensor in rooms.views)),
+        rooms.depth.to(device),
+    )
 
 
 def room_loader(
@@ -218,16 +261,18 @@ class _OrError(Dataset[PosedImages | UserError]):
             return error
 
 
-def _collate(items: list[PosedImages | UserError]) -> PosedImages | UserError:
+def _collate(items: list[PosedImages | UserError]) -> PosedImages | UserError | None:
     for item in items:
         if isinstance(item, UserError):
             return item
+    if not items:  # a step in which this process's places get no new room
+        return None
     batch: PosedImages = default_collate(items)
     return batch
 
 
 class BatchMaker:
-    """Rooms as rendered, or tuples as read, to :class:`Batch`.
+    """Rooms as rendered, or tuples as read, to :class:`Batch`, on the device they are on.
 
     Args:
         config: of the run.
@@ -239,57 +284,63 @@ class BatchMaker:
         self.part = part
         self.photometry = Photometry()
 
+    @torch.no_grad()
     def __call__(self, rooms: PosedImages, step: int) -> Batch:
         """The batch of a step."""
-        config = self.config
+        config, device = self.config, rooms.images.device
         # The number of views and the image size are common to a step's rooms, wherever they are.
         random = torch.Generator().manual_seed(_seed(config.seed, step))
         num_views = int(torch.randint(config.min_views, config.max_views + 1, (), generator=random))
         size = config.sizes[int(torch.randint(len(config.sizes), (), generator=random))]
-        made = [
-            self._room(room, num_views, size, _seed(config.seed, step, place))
-            for room, place in zip(_one_by_one(rooms), self.part.of(config.batch_size), strict=True)
+        places = self.part.of(config.batch_size)
+        drawn = [
+            _draw(config, num_views, rooms.depth.shape[1], _seed(config.seed, step, place))
+            for place in places
         ]
-        return Batch(
-            images=torch.cat([room.images for room in made]),
-            views=PosedViews(*map(torch.cat, zip(*(room.views for room in made), strict=True))),
-            true_views=PosedViews(
-                *map(torch.cat, zip(*(room.true_views for room in made), strict=True))
-            ),
-            depth=torch.cat([room.depth for room in made]),
-            shift=torch.cat([room.shift for room in made]),
-            anchors=torch.cat([room.anchors for room in made]),
+        order, flips, errors, shift = (
+            torch.stack(parts).to(device) for parts in zip(*drawn, strict=True)
         )
-
-    def _room(self, room: PosedImages, num_views: int, size: tuple[int, int], seed: int) -> Batch:
-        """A batch of one."""
-        random = torch.Generator().manual_seed(seed)
-        if self.config.data.source == "rooms":
-            room = choose_views(room, num_views, random)
+        if config.data.source == "rooms":
+            rooms = choose_views(rooms, order)
         else:
-            room = first_views(room, num_views)
-        room = room._replace(images=room.images.float() / 255)
-        room = mirror(resize(room, size), torch.rand(1, generator=random) < 0.5)
+            rooms = first_views(rooms, num_views)
+        rooms = rooms._replace(images=rooms.images.float() / 255)
+        rooms = mirror(resize(rooms, size), flips)
+        images = self.photometry(
+            rooms.images, _seed(config.seed, step), first=places.start, places=config.batch_size
+        )
         return Batch(
-            images=self.photometry(room.images, seed),
-            views=disturb_poses(room.views, self.config.pose_noise, random),
-            true_views=room.views,
-            depth=room.depth,
-            shift=torch.rand(1, 2, generator=random),
-            anchors=room.images[:, 0],
+            images=images,
+            views=disturb_poses(rooms.views, errors),
+            true_views=rooms.views,
+            depth=rooms.depth,
+            shift=shift,
+            anchors=rooms.images[:, 0],
         )
 
 
-def _one_by_one(rooms: PosedImages) -> list[PosedImages]:
-    """Batches of one room."""
-    return [
-        PosedImages(
-            rooms.images[i : i + 1],
-            PosedViews(*(tensor[i : i + 1] for tensor in rooms.views)),
-            rooms.depth[i : i + 1],
-        )
-        for i in range(len(rooms.depth))
-    ]
+class _Drawn(NamedTuple):
+    """What chance decides about a room in a step."""
+
+    order: Tensor
+    """``(num_views,)`` int64, which of its views."""
+    flip: Tensor
+    """Bool scalar: mirrored."""
+    errors: Tensor
+    """``(num_views, 4, 4)`` motions of the poses."""
+    shift: Tensor
+    """``(2,)`` of the spread keypoints."""
+
+
+def _draw(config: TrainConfig, num_views: int, available: int, seed: int) -> _Drawn:
+    random = torch.Generator().manual_seed(seed)
+    order = torch.randperm(available, generator=random)[:num_views]
+    flip = torch.rand((), generator=random) < 0.5
+    # Some trackers are better than others, and so are some moments.
+    grade = float(torch.empty(()).uniform_(-1.4, 0.7, generator=random).exp())
+    noise = (grade * config.pose_noise[0], grade * config.pose_noise[1])
+    errors = draw_pose_errors(num_views, noise, random)
+    return _Drawn(order, flip, errors, torch.rand(2, generator=random))
 
 
 def _seed(*key: int) -> int:

@@ -68,13 +68,15 @@ def fit(
     fabric = launch_fabric(config)
     tell = report if fabric.is_global_zero else _silently
     data, held_out = training_data(config, report=tell), validation_data(config, report=tell)
-    state, origin, teacher = starting_state(config, folder, start, fabric)
+    state, origin, teacher = starting_state(config, folder, start, fabric, tell)
     objective = Objective(state.model, config)
     wrapped, optimizer = fabric.setup(objective, state.optimizer)
     stepper = Stepper(objective, wrapped, optimizer, fabric, teacher)
     maker = BatchMaker(config, part_of(fabric))
     step, last = state.step, min(config.steps, stop or config.steps)
-    loader = step_loader(data, config, start=step, stop=last, part=part_of(fabric))
+    loader = step_loader(
+        data, config, start=step, stop=last, part=part_of(fabric), device=fabric.device
+    )
     saved = step if start.resume else -1
 
     def save() -> None:
@@ -92,7 +94,7 @@ def fit(
         for rooms in loader:
             began = time.perf_counter()
             rate = set_learning_rate(state.optimizer, step, config)
-            batch = fabric.to_device(maker(rooms, step))
+            batch = maker(rooms, step)
             result = stepper(batch, stop=request.made)
             if result.done:
                 state.average.update(state.model, step)

@@ -1,5 +1,6 @@
 """What a run starts from: random weights, an encoder, a weights file or its own checkpoint."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -10,7 +11,7 @@ from torch import nn
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import load_weights, read_metadata
+from deltas_nets.pretrained import read_metadata, start_from_weights
 from deltas_nets.teachers import load_teacher
 from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.average import RunningAverage
@@ -30,7 +31,7 @@ class Start:
 
     Attributes:
         encoder: an EfficientNet-Lite0 checkpoint for the encoder.
-        init: a weights file for the whole network.
+        init: a weights file for the whole network, which may have grown since.
         step: the first step, for a schedule that goes on from ``init``.
         resume: go on from the checkpoint in the run's folder.
         teacher: weights of the teacher that the config names. They are in no checkpoint: to go on
@@ -58,8 +59,21 @@ class Started(NamedTuple):
     teacher: TeacherLabels | None
 
 
-def starting_state(config: TrainConfig, folder: Path, start: Start, fabric: "Fabric") -> Started:
+def starting_state(
+    config: TrainConfig,
+    folder: Path,
+    start: Start,
+    fabric: "Fabric",
+    report: Callable[[str], None] = lambda _: None,
+) -> Started:
     """Network, average and optimizer, the same in every process.
+
+    Args:
+        config: of the run.
+        folder: of the run.
+        start: what to start from.
+        fabric: launched.
+        report: gets lines about what was done.
 
     Raises:
         UserError: a file to start from is missing or does not fit, or the run to go on with has
@@ -78,7 +92,9 @@ def starting_state(config: TrainConfig, folder: Path, start: Start, fabric: "Fab
         if not start.init.is_file():
             raise UserError("no such weights", start.init, "name a .safetensors file with --init")
         origin = read_metadata(start.init).get("origin", "unknown weights")
-        load_weights(model, start.init)
+        new = start_from_weights(model, start.init)
+        if new:
+            report(f"{start.init} lacks {len(new)} weights of this network: they start anew")
         model.calibration.reset()  # it was fitted to what is about to change
     if fabric.world_size > 1:
         parameters = dict(model.named_parameters())

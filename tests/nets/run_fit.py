@@ -9,6 +9,7 @@ half=STEP   stops for a minute when half of the checkpoint after STEP is written
             a file named "writing" in the folder
 poison=RANK that process sees NaN in step 1 and from step 3 on, counted from 0
 stop=RANK   that process gets SIGTERM in step 1
+idle        the network has parameters that no loss depends on
 teacher=FILE   weights of the config's teacher
 """
 
@@ -27,7 +28,7 @@ from typing import IO, Any
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from deltas_geom import PosedViews
 from deltas_nets.config import (
@@ -41,6 +42,7 @@ from deltas_nets.config import (
 )
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit
@@ -202,6 +204,16 @@ def poison() -> None:
     BatchMaker.__call__ = poisoned  # type: ignore[method-assign, assignment]
 
 
+def add_idle_parameters() -> None:
+    build = Deltas.__init__
+
+    def with_more(model: Deltas, config: NetworkConfig) -> None:
+        build(model, config)
+        model.idle = nn.Linear(2, 2)
+
+    Deltas.__init__ = with_more  # type: ignore[method-assign]
+
+
 def get_told_to_stop() -> None:
     make = BatchMaker.__call__
 
@@ -222,6 +234,8 @@ def main() -> None:
         stop_half_written(folder, int(options["half"]))
     if options.get("poison") == rank:
         poison()
+    if "idle" in options:
+        add_idle_parameters()
     if options.get("stop") == rank:
         get_told_to_stop()
     with double_precision() if "double" in options else nullcontext():

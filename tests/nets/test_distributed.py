@@ -40,13 +40,16 @@ FROZEN = replace(CONFIG, steps=4, freeze_batch_norm=True)
 
 
 def assert_close(one: Path, other: Path, tolerance: float) -> None:
-    """Weights, average and losses of two runs agree within an absolute tolerance."""
+    """Weights and average of two runs agree within an absolute tolerance, losses as closely.
+
+    A loss may be large: then it is the share of it.
+    """
     first, second = read_checkpoint(one), read_checkpoint(other)
     assert first["step"] == second["step"]
     for part in ("model", "average"):
         torch.testing.assert_close(second[part], first[part], rtol=0, atol=tolerance)
     for entry, expected in zip(logged(other), logged(one), strict=True):
-        assert entry == pytest.approx(expected, abs=tolerance)
+        assert entry == pytest.approx(expected, rel=tolerance, abs=tolerance)
 
 
 @pytest.fixture(scope="module")
@@ -161,15 +164,15 @@ NETWORKS = {
     "deltas-vgg9": CONFIGS["deltas-vgg9"],
     "points alone": ALONE,
 }
-IDLE = [f"matcher.context.embed.{name}" for name in ("0.weight", "0.bias", "2.weight", "2.bias")]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_parameters_that_no_loss_reaches_are_found(name: str) -> None:
     config = replace(CONFIG, network=NETWORKS[name], batch_size=1)
     model = Deltas(config.network)
+    model.idle = nn.Linear(2, 2)
     found = unreached(model, config)
-    assert found == (IDLE if name == "points alone" else [])
+    assert found == ["idle.weight", "idle.bias"]
     assert all(parameter.grad is None for parameter in model.parameters())
     # Whatever the number of views, the others get a gradient.
     for views in (2, 3):
@@ -183,7 +186,7 @@ def test_parameters_that_no_loss_reaches_are_found(name: str) -> None:
 
 @pytest.mark.slow
 def test_parameters_that_no_loss_reaches_do_not_hold_two_processes_up(tmp_path: Path) -> None:
-    finish(launch(tmp_path / "run", replace(CONFIG, network=ALONE, steps=3), processes=2))
+    finish(launch(tmp_path / "run", replace(CONFIG, steps=3), "idle", processes=2))
     assert read_checkpoint(tmp_path / "run")["step"] == 3
 
 

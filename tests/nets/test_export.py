@@ -370,6 +370,7 @@ def test_a_network_in_training_is_not_exported(untrained: Deltas, tmp_path: Path
         {"num_points": 7},
         {"image_size": (31, 64)},
         {"depth_range": (2.0, 1.0)},
+        {"refinement": 0},
     ],
     ids=lambda wrong: next(iter(wrong)),
 )

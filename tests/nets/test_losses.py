@@ -53,9 +53,9 @@ def true_matches(targets: Targets) -> Matches:
 def dense(log_depth: torch.Tensor, log_spread: float = -3.0) -> DenseDepth:
     scales = [
         torch.nn.functional.adaptive_avg_pool2d(log_depth, (64 // s, 96 // s))
-        for s in (2, 4, 8, 16)
+        for s in (1, 4, 8, 16)
     ]
-    return DenseDepth(tuple(scales), torch.full((1, 1, 32, 48), log_spread))
+    return DenseDepth(tuple(scales), torch.full((1, 1, 64, 96), log_spread))
 
 
 def test_true_matches_and_points_cost_nothing(room: PosedImages, targets: Targets) -> None:

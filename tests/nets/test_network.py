@@ -72,7 +72,8 @@ def test_shapes_are_as_documented(prediction: DepthPrediction) -> None:
     assert prediction.points.points.shape == (64, 3)
     assert prediction.sparse.depth.shape == (1, *SIZE)
     sizes = [scale.shape[-2:] for scale in prediction.evidence.dense.log_depth]
-    assert sizes == [(32, 48), (16, 24), (8, 12), (4, 6)]
+    assert sizes == [SIZE, (16, 24), (8, 12), (4, 6)]
+    assert prediction.evidence.dense.log_spread.shape[-2:] == SIZE
 
 
 def test_the_anchors_match_is_the_keypoint(prediction: DepthPrediction) -> None:
@@ -247,9 +248,34 @@ def test_exchange_without_learned_correction_sharpens_agreement() -> None:
     logits = torch.zeros(1, 6, 16)
     logits[..., 4] = 2.0
     logits[0, 0, 11] = 2.5  # one point prefers another depth than all its neighbours
-    stages = context(logits, torch.zeros(1, 6, 8), torch.rand(1, 6, 2))
+    stages = context(logits, torch.zeros(1, 6, 8), torch.rand(1, 6, 2)).stages
     assert stages[0][0, 0].argmax() == 11
     assert stages[-1][0, 0].argmax() == 4
+
+
+def test_rounds_beyond_the_second_start_as_the_identity_and_learn() -> None:
+    torch.manual_seed(0)
+    context = Context(8, rounds=4, heads=2).eval()
+    stages, embedding = context(torch.randn(2, 6, 16), torch.randn(2, 6, 8), torch.rand(2, 6, 2))
+    assert embedding.shape == (2, 6, 64)
+    assert len(stages) == 5
+    assert not torch.equal(stages[1], stages[0]) and not torch.equal(stages[2], stages[1])
+    assert torch.equal(stages[3], stages[2]) and torch.equal(stages[4], stages[3])
+    stages[-1].square().sum().backward()
+    for further in context.rounds[2:]:
+        gain = further.get_parameter("gain")
+        assert gain.grad is not None and (gain.grad != 0).all()
+
+
+def test_another_way_to_say_how_many_samples_gives_the_same_depth(
+    images: Tensor, room: PosedImages
+) -> None:
+    model = make_model()
+    with torch.no_grad():
+        usual, roomy = model(images, room.views), model(images, room.views, refinement=8)
+    torch.testing.assert_close(roomy.depth, usual.depth, rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="refinement must be at least 1"):
+        model(images, room.views, refinement=0)
 
 
 def test_the_detectors_fine_branch_starts_as_no_correction_and_then_moves_points_alone() -> None:

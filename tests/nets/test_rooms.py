@@ -107,9 +107,9 @@ def test_views_agree_on_depth_and_colour_where_both_see(rooms: list[PosedImages]
             seen.append(visible.float().mean())
             agreeing.append(close.sum() / visible.sum())
             differences.append(difference[close].mean())
-    assert 0.6 < torch.stack(seen).mean() < 0.95
-    assert torch.stack(agreeing).min() > 0.9
-    assert torch.stack(agreeing).mean() > 0.95
+    assert 0.4 < torch.stack(seen).mean() < 0.95
+    assert torch.stack(agreeing).min() > 0.98
+    assert torch.stack(agreeing).mean() > 0.99
     assert torch.stack(differences).mean() < 6  # grey levels
 
 
@@ -385,7 +385,11 @@ def compare(room: PosedImages, *, anchor: int, source: int) -> tuple[Tensor, Ten
         )[0, :, 0]
 
     # Inverse depth is affine on a plane: bilinear reading is exact there, also when it slants.
-    ratio = 1 / (look_up(1 / room.depth[source, None], "bilinear")[0] * expected)
+    inverse = 1 / room.depth[source, None]
+    ratio = 1 / (look_up(inverse, "bilinear")[0] * expected)
+    # Beside a silhouette it reads two surfaces at once.
+    reach = F.max_pool2d(torch.cat([inverse, -inverse]), 3, stride=1, padding=1)
+    inside &= look_up((reach[:1] / -reach[1:] > 1.1).float(), "bilinear")[0] == 0
     colour = look_up(room.images[source].float(), "bilinear")
     difference = (colour - room.images[anchor].float().flatten(1)).abs().mean(dim=0)
     return ratio, difference, inside

@@ -133,7 +133,7 @@ def plant(rng: np.random.Generator) -> list[Solid]:
     if rng.random() < 0.5:
         stem = rng.uniform(0.2, 1.0)
         solids.append(cylinder(0.0, 0.0, 0.02, (-h - stem, -h), "foliage"))
-        for _ in range(rng.integers(8, 25)):
+        for _ in range(rng.integers(8, 36)):
             length, width = rng.uniform((0.12, 0.015), (0.35, 0.04))
             turn = rotation(yaw=rng.uniform(-np.pi, np.pi), pitch=rng.uniform(-0.6, 1.2))
             root = np.array([0.0, -h - rng.uniform(0.2, 1.0) * stem, 0.0])
@@ -144,6 +144,25 @@ def plant(rng: np.random.Generator) -> list[Solid]:
         x, y, z = rng.uniform((-0.2, -h - 0.9, -0.2), (0.2, -h - 0.1, 0.2))
         half = rng.uniform(0.04, 0.25, 3)
         solids.append(Solid(ELLIPSOID, np.array([x, y, z]), half, _any_rotation(rng), "foliage"))
+    return solids
+
+
+def rack(rng: np.random.Generator) -> list[Solid]:
+    """Bars between two posts, upright as of a railing or level as of a drying rack."""
+    w, h, thin = rng.uniform((0.3, 0.7, 0.004), (0.9, 1.7, 0.018))
+    solids = [cylinder(side * w, 0.0, 1.3 * thin, (-h, 0.0), "metal") for side in (-1, 1)]
+    solids.append(box((-w, w), (-h - 2 * thin, -h), (-thin, thin), "metal"))
+    count, low = int(rng.integers(3, 12)), rng.uniform(0.05, 0.4)
+    if rng.random() < 0.5:
+        solids.append(box((-w, w), (-low - 2 * thin, -low), (-thin, thin), "metal"))
+        for x in np.linspace(-w, w, count + 2)[1:-1]:
+            solids.append(cylinder(float(x), 0.0, thin, (-h, -low), "metal"))
+        return solids
+    for y in np.linspace(-h, -low, count + 1)[1:]:
+        solids.append(box((-w, w), (float(y) - thin, float(y) + thin), (-thin, thin), "metal"))
+    if rng.random() < 0.5:  # something hangs over it
+        x, wide = rng.uniform((-0.5, 0.1), (0.5, 0.4)) * w
+        solids.append(box((x - wide, x + wide), (-h - 0.03, -0.5 * h), (-0.03, 0.03), "cloth"))
     return solids
 
 

@@ -10,7 +10,7 @@ from deltas_nets.data.synthetic.furniture import rotation
 Array = NDArray[np.float64]
 
 FOCAL_RANGE = (0.75, 1.45)  # of the image width
-BASELINE_RANGE = (0.04, 0.45)  # m, between any two views of one rig
+BASELINE_RANGE = (0.03, 0.6)  # m, between any two views of one rig
 WALL_MARGIN = 0.4  # m, no camera comes nearer to a wall, the floor or the ceiling
 MAX_PITCH = 0.7  # rad
 MAX_VIEWS = 12
@@ -102,7 +102,7 @@ def _draw_offsets(rng: np.random.Generator, num_views: int) -> Array:
         sway = rng.normal(scale=0.004, size=(num_views, 3)) * (places != 0)[:, None]
         line: Array = places[:, None] * step * direction + sway
         return line
-    scale = rng.uniform(0.1, 0.3)  # m, small for slow hands, large for walking
+    scale = rng.uniform(0.1, 0.36)  # m, small for slow hands, large for walking
     offsets = np.zeros((1, 3))
     while len(offsets) < num_views:
         candidate = _direction(rng) * scale * rng.uniform(0.3, 1.4)
@@ -124,9 +124,10 @@ def _source_turn(rng: np.random.Generator, offset: Array, distance: float) -> Ar
     """Anchor-from-source rotation that partly fixates a point ahead, with some jitter."""
     fixate = rng.uniform(-0.2, 1.0)
     x, y, z = offset
-    yaw = -fixate * np.arctan2(x, distance - z) + rng.normal(scale=0.04)
-    pitch = fixate * np.arctan2(y, distance - z) + rng.normal(scale=0.03)
-    return rotation(yaw=yaw, pitch=pitch, roll=rng.normal(scale=0.035))
+    loose = 1.0 if rng.random() < 0.75 else 3.5  # now and then the head turns
+    yaw = -fixate * np.arctan2(x, distance - z) + rng.normal(scale=0.04 * loose)
+    pitch = fixate * np.arctan2(y, distance - z) + rng.normal(scale=0.03 * loose)
+    return rotation(yaw=yaw, pitch=pitch, roll=rng.normal(scale=0.035 * loose))
 
 
 def _free_space(room_half_size: Array) -> tuple[Array, Array]:

@@ -67,6 +67,8 @@ FREE_STANDING: tuple[Callable[[np.random.Generator], list[Solid]], ...] = (
     furniture.lamp,
     furniture.hanging_lamp,
     furniture.plant,
+    furniture.plant,
+    furniture.rack,
     furniture.column,
     furniture.cabinet,
     furniture.sofa,
