@@ -159,7 +159,7 @@ def finished(file: Path, settings: dict[str, int]) -> dict[str, dict[str, Any]]:
 def table(records: dict[str, dict[str, Any]]) -> str:
     """The variants in their order, as Markdown."""
     rows = [
-        "variant | weights | GMACs | CPU s/step | points Abs Rel / delta | dense Abs Rel / delta",
+        "variant | parameters | GMACs | CPU s/step | points Abs Rel/delta | dense Abs Rel/delta",
         " | ".join(["---", *["---:"] * 5]),
     ]
     for name, found in ((name, records[name]) for name in VARIANTS if name in records):

@@ -181,7 +181,7 @@ DIFFERENCES = (
         "Supervised scales",
         "four scales from full resolution to 1/16",
         "has four outputs at 1, 1/2, 1/4 and 1/8",
-        "the paper's decoder has the published four; `deltas-small` has 1/2, 1/4, 1/8 and 1/16",
+        "the paper's decoder has the published four; `deltas-small` has 1, 1/4, 1/8 and 1/16",
     ),
     Difference(
         22,

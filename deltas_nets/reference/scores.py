@@ -49,12 +49,13 @@ def correlate_samples(descriptors: Tensor, keypoints: Tensor, samples: Tensor) -
         keypoints: ``(B, N, 2)`` pixels of the anchor.
         samples: ``(B, V, N, 3, 100, 2)`` pixels of the sources.
     """
-    template = sample_descriptors(descriptors[:, 0], keypoints[:, :, None])  # (B, D, N, 1)
+    template = sample_descriptors(descriptors[:, 0], keypoints[:, :, None]).squeeze(-1)  # (B, D, N)
     maps = []
     # View by view: the descriptors of all samples at once would take V times the memory.
     for source, positions in zip(descriptors[:, 1:].unbind(1), samples.unbind(1), strict=True):
         read = sample_descriptors(source, positions.flatten(2, 3))
-        maps.append((template * read).sum(dim=1).view(positions.shape[:-1]))
+        products = torch.einsum("bdn,bdns->bns", template, read)
+        maps.append(products.view(positions.shape[:-1]))
     return torch.stack(maps, dim=1)
 
 

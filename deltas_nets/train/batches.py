@@ -32,6 +32,7 @@ from deltas_nets.data.scannet_tuples import ScanNetTuples, open_scannet
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
 from deltas_nets.train.shelves import Shelves, places_with_new_rooms
+from deltas_nets.train.stop import leave_to_the_trainer
 
 
 class Part(NamedTuple):
@@ -223,6 +224,7 @@ def step_loader(
         batch_sampler=sampler,
         num_workers=config.data.workers,
         collate_fn=_collate,
+        worker_init_fn=leave_to_the_trainer,
     )
     for step, rooms in enumerate(loader, first):
         if isinstance(rooms, UserError):

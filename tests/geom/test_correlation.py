@@ -217,6 +217,34 @@ def test_many_keypoints_correlate_as_few_do(function: Correlation) -> None:
 
 
 @BOTH
+@pytest.mark.parametrize("limit", [1, 100, 500, 2000])
+@pytest.mark.parametrize("batch", [(), (5,), (3, 2)])
+def test_pieces_of_any_size_make_the_whole(
+    function: Correlation, batch: tuple[int, ...], limit: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By groups of views, view by view, or by chunks of keypoints, as memory allows."""
+    descriptors, features, pixels = random_scene(count=40)
+    generator = torch.Generator().manual_seed(1)
+
+    def varied(tensor: Tensor) -> Tensor:
+        scale = 1 + 0.1 * torch.rand(*batch, *[1] * tensor.ndim, generator=generator)
+        return (scale.to(tensor.dtype) * tensor).requires_grad_()
+
+    inputs = [varied(descriptors), varied(features)]
+    samples = samples_at(varied(pixels))
+    pull = torch.randn(*batch, 2, 40, 1, 2, generator=generator, dtype=torch.float64)
+
+    def outcome() -> tuple[Tensor, ...]:
+        found = function(*inputs, samples, image_size=SIZE)
+        return found, *torch.autograd.grad((found * pull).sum(), inputs)
+
+    whole = outcome()
+    monkeypatch.setattr("deltas_geom.correlation._CACHED_ELEMENTS", limit)
+    for piece, expected in zip(outcome(), whole, strict=True):
+        assert_close(piece, expected, rtol=0, atol=1e-11)
+
+
+@BOTH
 def test_first_and_second_derivatives_are_right(function: Correlation) -> None:
     mask = torch.rand(2, 3, 1, 2, generator=torch.Generator().manual_seed(1)) < 0.8
 

@@ -9,6 +9,7 @@ half=STEP   stops for a minute when half of the checkpoint after STEP is written
             a file named "writing" in the folder
 poison=RANK that process sees NaN in step 1 and from step 3 on, counted from 0
 stop=RANK   that process gets SIGTERM in step 1
+stop-all    it and all that it started get it
 idle        the network has parameters that no loss depends on
 teacher=FILE   weights of the config's teacher
 """
@@ -20,7 +21,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -214,12 +215,13 @@ def add_idle_parameters() -> None:
     Deltas.__init__ = with_more  # type: ignore[method-assign]
 
 
-def get_told_to_stop() -> None:
+def get_told_to_stop(tell: Callable[[int], None]) -> None:
     make = BatchMaker.__call__
 
     def told(maker: BatchMaker, rooms: PosedImages, step: int) -> Batch:
         if step == 1:
-            signal.raise_signal(signal.SIGTERM)
+            tell(signal.SIGTERM)
+            time.sleep(1)  # until it has reached all
         return make(maker, rooms, step)
 
     BatchMaker.__call__ = told  # type: ignore[method-assign, assignment]
@@ -237,7 +239,9 @@ def main() -> None:
     if "idle" in options:
         add_idle_parameters()
     if options.get("stop") == rank:
-        get_told_to_stop()
+        get_told_to_stop(signal.raise_signal)
+    if "stop-all" in options:
+        get_told_to_stop(lambda number: os.killpg(0, number))
     with double_precision() if "double" in options else nullcontext():
         teacher = Path(options["teacher"]) if "teacher" in options else None
         start = Start(resume="resume" in options, teacher=teacher)

@@ -3,9 +3,10 @@
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from run_fit import CONFIG, assert_same_state, launch, logged, read_checkpoint, train
+from run_fit import CONFIG, assert_same_state, finish, launch, logged, read_checkpoint, train
 
 from deltas_nets.train.fit import Start
 
@@ -33,3 +34,16 @@ def test_a_run_killed_while_it_writes_a_checkpoint_ends_as_an_unbroken_one(tmp_p
     assert_same_state(killed, unbroken)
     assert logged(killed) == logged(unbroken)
     assert not list(killed.glob(".*"))
+
+
+def test_a_signal_to_the_whole_group_ends_it_between_two_steps(tmp_path: Path) -> None:
+    """A terminal's Ctrl-C, `timeout` and job schedulers reach the processes that render, too."""
+    unbroken, stopped = tmp_path / "unbroken", tmp_path / "stopped"
+    ahead = replace(CONFIG, data=replace(CONFIG.data, workers=2))
+    said = finish(launch(stopped, ahead, "stop-all"), code=-signal.SIGINT)
+    assert "KeyboardInterrupt" in said
+    assert "exited unexpectedly" not in said
+    assert read_checkpoint(stopped)["step"] == 2
+    train(unbroken, CONFIG, Start())
+    train(stopped, CONFIG, Start(resume=True))
+    assert_same_state(stopped, unbroken)
