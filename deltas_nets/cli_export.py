@@ -34,7 +34,7 @@ class Export:
     """Of the images."""
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
-    refinement: int = 4
+    refinement: int = 8
     """Depths searched per sample, at most: wide baselines need up to 8, which takes longer."""
     overwrite: Flag = False
     """Replace --out if it exists."""

@@ -48,20 +48,20 @@ class MatcherConfig:
     kind: Literal["joint", "per_view"] = "joint"
     """joint fuses all views at common inverse depths; per_view decides in each, as the paper."""
     num_samples: int = 64
-    """Samples along a segment (the paper: 100)."""
+    """per_view: samples along a segment (the paper: 100); joint: bins of inverse depth."""
     offsets: tuple[float, ...] = (-1.0, 0.0, 1.0)
     """per_view: parallel lines searched besides the epipolar line, pixels."""
     step: float = 1.5
-    """joint: depths are searched at most this far apart in the widest view, pixels; a sample is
+    """joint: depths are searched this far apart in the widest view, pixels, or closer: bins are
     subdivided until they are."""
     max_refinement: int = 8
-    """joint: a sample is subdivided into at most this many."""
+    """joint: a bin is subdivided into at most this many samples."""
     context_rounds: int = 3
     """joint: rounds in which points exchange evidence before they decide; 0 is none."""
     context_heads: int = 4
     """joint: attention heads in each round."""
     window: int = 2
-    """joint: soft-argmax looks this many samples to either side of the peak."""
+    """joint: soft-argmax looks this many bins to either side of the peak."""
     refine_radius: float = 3.0
     """joint: the 2D match may move this far along the epipolar line, pixels."""
 
@@ -153,13 +153,14 @@ class DataConfig:
     width: int = 256
     """Width of the images that are rendered or read, pixels."""
     cache: str | None = None
-    """Folder that keeps rendered rooms, 1.7 MB each, or ScanNet's poses, 0.15 KB a frame; without
-    it they are rendered or read each time."""
+    """Folder that keeps rendered rooms, 7 bytes a pixel of every view, or ScanNet's poses, 0.15 KB
+    a frame; without it they are rendered or read each time."""
     workers: int = 1
     """Processes that read or render ahead; 0 does it in the training process."""
     replay: int = 1
-    """Steps in which a room that was rendered or read is used on average, with other anchors and
-    sources, in another light: for processors that learn faster than rooms are rendered."""
+    """Steps in which a room that was rendered or read is used on average, in another light, and of
+    rooms with other anchors and sources: for processors that learn faster than rooms are
+    rendered."""
     shelf: int = 1
     """Rooms that each place of a step keeps in the memory of the device, to take one at random;
     about as many as --data.replay or more."""

@@ -110,11 +110,19 @@ def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
         Weights that the file lacks: they stay as they are.
 
     Raises:
-        UserError: a weight is left over or of another shape.
+        UserError: a weight is left over or of another shape, or more than half are lacking: these
+            are another network's.
     """
     with safe_open(str(file), framework="pt") as opened:
         state = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-    grown = {name: value for name, value in model.state_dict().items() if name not in state}
+    own = model.state_dict()
+    grown = {name: value for name, value in own.items() if name not in state}
+    if 2 * len(grown) > len(own):
+        raise UserError(
+            f"weights do not fit the network ({len(grown)} of {len(own)} are lacking)",
+            file,
+            "name a weights file of this kind of network",
+        )
     _load(model, {**grown, **state}, file)
     return list(grown)
 

@@ -45,12 +45,12 @@ def mirror(batch: PosedImages, flips: Tensor) -> PosedImages:
 
     Args:
         batch: ``(B, V, ...)``.
-        flips: ``(B)`` bool.
+        flips: ``(B,)`` bool.
     """
     width = batch.images.shape[-1]
     K = batch.views.K.clone()
     K[..., 0, 2] = width - 1 - K[..., 0, 2]
-    reflect = torch.eye(4, device=K.device)
+    reflect = torch.eye(4, device=K.device, dtype=K.dtype)
     reflect[0, 0] = -1
     mirrored = PosedImages(
         batch.images.flip(-1),

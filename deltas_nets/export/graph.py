@@ -34,9 +34,10 @@ class ExportConfig:
     """(height, width) of the images, pixels."""
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
-    refinement: int = 4
+    refinement: int = 8
     """Samples per bin of inverse depth, at most. The network takes as many as the widest view
-    needs, up to its config's max_refinement; a file takes the time of these always."""
+    needs, up to its config's max_refinement, 8 by default; a file takes the time of these always,
+    and with fewer it is another network where views are too wide for them."""
 
     def __post_init__(self) -> None:
         if self.num_views < 2:

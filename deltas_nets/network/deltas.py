@@ -23,7 +23,7 @@ from deltas_nets.network.detector import Keypoints
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.matcher import Posterior
-from deltas_nets.network.parallax import parallax_of, relative_error_per_pixel
+from deltas_nets.network.parallax import depth_sensitivity
 
 
 class Evidence(NamedTuple):
@@ -197,11 +197,11 @@ class Deltas(nn.Module):
             )
             matches, posterior, confidence = matched.matches, matched.posterior, matched.confidence
             points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
+            sensitivity = depth_sensitivity(views, points, matches.mask[:, 1:])
             if self.judge is not None and matched.decision is not None:
-                confidence = self.judge(matched.decision, matches, posterior, points, views)
+                confidence = self.judge(matched.decision, matches, posterior, points, sensitivity)
             depth = points.depth[:, 0]
             near, far = 0.5 * depth_range[0], 2 * depth_range[1]
-            parallax = parallax_of(views, points, matches.mask[:, 1:])
             sparse, doubt = (
                 rasterize_depth(
                     keypoints.pixels,
@@ -211,7 +211,7 @@ class Deltas(nn.Module):
                     weights=confidence,
                     reduce="mean",
                 )
-                for values in (depth, relative_error_per_pixel(views, parallax))
+                for values in (depth, sensitivity.error_per_pixel)
             )
         dense = self.densifier(features, sparse, doubt)
 

@@ -60,7 +60,7 @@ def interpolate_sparse(
     its weight carries and takes the rest from the next coarser level (push).
 
     Args:
-        sparse: ``(B, 1, H, W)``.
+        sparse: ``(B, 1, H, W)`` depth, or another positive quantity in its place.
         stride: of the result.
         fallback: depth where the image holds no point at all, metres.
 
@@ -77,7 +77,9 @@ def interpolate_sparse(
         levels.append(level)
     # The whole image's mean is the last resort, and a constant where there is no point.
     log_fallback = math.log(fallback)
-    default = level.new_tensor([1.0, log_fallback, log_fallback**2]).view(1, 3, 1, 1)
+    # Not new_tensor, which copies numbers of the host to the device and waits for them.
+    powers = [level.new_full((1, 1, 1), log_fallback**power) for power in range(3)]
+    default = torch.stack(powers, dim=1)
     total = level.sum(dim=(-2, -1), keepdim=True)
     mean = (total + 1e-6 * default) / (total[:, :1] + 1e-6)
     coverage = total[:, :1]

@@ -72,8 +72,8 @@ def subdivide(centres: Tensor, counts: Tensor, most: int) -> Tensor:
         most: at least the largest count; the last sample is repeated up to it.
     """
     number = torch.arange(most, device=centres.device).minimum(counts[:, None] - 1)
-    offset = (number + 0.5) / counts[:, None] - 0.5
-    samples = centres[:, None] + offset[:, None].to(centres.dtype) * (centres[1] - centres[0])
+    offset = (number + 0.5) / counts[:, None].to(centres.dtype) - 0.5
+    samples = centres[:, None] + offset[:, None] * (centres[1] - centres[0])
     return samples.clamp_min(0)  # the farthest bin may reach beyond infinity
 
 

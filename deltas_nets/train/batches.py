@@ -1,4 +1,4 @@
-"""What each training step sees: a function of the config and the step's number alone.
+"""What each training step sees: on one kind of device, a function of config and step alone.
 
 So a resumed run continues exactly, a step can be looked at without running those before, and
 several processes see together what one would: each takes its part of every step's rooms, and
@@ -207,6 +207,8 @@ def step_loader(
     Raises:
         UserError: one of them cannot be read.
     """
+    if start >= stop:  # nothing to fill shelves for
+        return
     places, replay = part.of(config.batch_size), config.data.replay
     shelves = Shelves(places, config.data.shelf, replay, seed=config.seed)
     first = shelves.first_step(start)

@@ -106,7 +106,7 @@ def load_run(folder: Path, state: RunState) -> tuple[RunState, str]:
         The state with its step, and the origin of the weights.
 
     Raises:
-        UserError: there is no checkpoint, or it cannot be read.
+        UserError: there is no checkpoint, it cannot be read, or is of another network.
     """
     file = folder / CHECKPOINT
     try:
@@ -115,7 +115,15 @@ def load_run(folder: Path, state: RunState) -> tuple[RunState, str]:
         raise UserError("no checkpoint to resume", file, "start without --resume") from None
     except (RuntimeError, EOFError, ValueError) as error:
         raise UserError(f"checkpoint is damaged ({error})", file, "start a new run") from None
-    state.model.load_state_dict(content["model"])
-    state.average.model.load_state_dict(content["average"])
-    state.optimizer.load_state_dict(content["optimizer"])
+    try:
+        state.model.load_state_dict(content["model"])
+        state.average.model.load_state_dict(content["average"])
+        state.optimizer.load_state_dict(content["optimizer"])
+    except (RuntimeError, ValueError) as error:
+        first = str(error).splitlines()[-1].strip()
+        raise UserError(
+            f"checkpoint of another version of the network ({first[:120]})",
+            file,
+            f"go on from its weights in a new folder: --init {folder / WEIGHTS}",
+        ) from None
     return state._replace(step=content["step"]), str(content["origin"])

@@ -5,13 +5,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from deltas_nets import load_model
-from deltas_nets.config import DetectorConfig, NetworkConfig
+from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.encoder import Encoder
-from deltas_nets.pretrained import load_weights, read_metadata, save_weights, weights_file
+from deltas_nets.pretrained import (
+    load_weights,
+    read_metadata,
+    save_weights,
+    start_from_weights,
+    weights_file,
+)
 
 
 def test_weights_and_config_survive_a_file(tmp_path: Path) -> None:
@@ -48,6 +55,31 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path) -> None:
     save_weights(tmp_path / "small.safetensors", small, {})
     with pytest.raises(UserError, match=r"do not fit the network .*small.safetensors"):
         load_weights(Deltas(NetworkConfig()), tmp_path / "small.safetensors")
+
+
+def test_training_goes_on_from_weights_of_before_the_network_grew(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    before = Deltas(NetworkConfig(matcher=MatcherConfig(context_rounds=2)))
+    save_weights(tmp_path / "before.safetensors", before, {})
+    grown = Deltas(NetworkConfig())
+    fresh = {name: tensor.clone() for name, tensor in grown.state_dict().items()}
+    new = start_from_weights(grown, tmp_path / "before.safetensors")
+    assert new
+    assert all(name.startswith("matcher.context.rounds.2.") for name in new)
+    for name, tensor in grown.state_dict().items():
+        expected = fresh[name] if name in new else before.state_dict()[name]
+        assert torch.equal(tensor, expected), name
+
+
+def test_weights_of_something_else_are_no_start(tmp_path: Path) -> None:
+    model = Deltas(NetworkConfig())
+    save_file({"judge.correction.0.weight": torch.zeros(32, 78)}, tmp_path / "few.safetensors")
+    with pytest.raises(UserError, match=r"are lacking.*few.safetensors"):
+        start_from_weights(model, tmp_path / "few.safetensors")
+    more = dict(model.state_dict()) | {"other": torch.zeros(1)}
+    save_file(more, tmp_path / "more.safetensors")
+    with pytest.raises(UserError, match=r"do not fit the network .*more.safetensors"):
+        start_from_weights(model, tmp_path / "more.safetensors")
 
 
 def test_the_pretrained_encoder_keeps_the_checkpoints_weights(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -111,7 +112,31 @@ def test_another_seed_takes_other_rooms() -> None:
     assert seen(config, 5, 6) != seen(replace(config, seed=1), 5, 6)
 
 
+def test_a_place_of_its_own_may_get_nothing_new_in_a_step() -> None:
+    config = config_of(1, 4, 3)
+    whole = seen(config, 3, 9)
+    alone = [seen(config, 3, 9, Part(number, 4)) for number in range(4)]
+    assert [
+        [room for place in places for room in place] for places in zip(*alone, strict=True)
+    ] == whole
+
+
+def test_a_finished_run_reads_nothing() -> None:
+    class Counting(Numbered):
+        read = 0
+
+        def __getitem__(self, index: int) -> PosedImages:
+            Counting.read += 1
+            return super().__getitem__(index)
+
+    config = config_of(2, 4, 6)
+    assert list(step_loader(Counting(100), config, start=7, stop=7)) == []
+    assert Counting.read == 0
+
+
 def test_nothing_is_taken_before_something_was_put() -> None:
     shelves = Shelves(range(2), 3, 2, seed=0)
     assert shelves.first_step(0) == -1
     assert shelves.first_step(20) == 15
+    with pytest.raises(AssertionError, match="put comes first"):
+        shelves.take(0)

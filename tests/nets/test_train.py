@@ -114,6 +114,15 @@ def test_a_resumed_run_equals_an_unbroken_one(tmp_path: Path, unbroken: Path) ->
     assert logged(tmp_path) == logged(unbroken)
 
 
+def test_a_run_whose_rooms_wait_in_memory_resumes_as_if_unbroken(tmp_path: Path) -> None:
+    data = replace(CONFIG.data, num_rooms=40, replay=2, shelf=2)
+    config = replace(CONFIG, data=data, steps=6)
+    fit(config, tmp_path / "whole", Start(), log_every=1)
+    fit(config, tmp_path / "broken", Start(), stop=3, log_every=1)
+    fit(config, tmp_path / "broken", Start(resume=True), log_every=1)
+    assert_same_state(tmp_path / "broken", tmp_path / "whole")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_run_told_to_stop_finishes_its_step_and_goes_on_later(
     tmp_path: Path, unbroken: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
@@ -275,6 +284,16 @@ def test_a_damaged_checkpoint_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "run" / "checkpoint.pt"
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(UserError, match=r"checkpoint is damaged .*checkpoint.pt"):
+        fit(CONFIG, tmp_path / "run", Start(resume=True))
+
+
+def test_a_checkpoint_of_a_network_of_before_is_an_error(tmp_path: Path) -> None:
+    fit(CONFIG, tmp_path / "run", Start(), stop=1)
+    file = tmp_path / "run" / "checkpoint.pt"
+    content = torch.load(file, weights_only=True)
+    del content["model"]["judge.correction.0.weight"]
+    torch.save(content, file)
+    with pytest.raises(UserError, match=r"another version .*judge.*--init .*weights.safetensors"):
         fit(CONFIG, tmp_path / "run", Start(resume=True))
 
 
