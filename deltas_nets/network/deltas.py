@@ -23,7 +23,6 @@ from deltas_nets.network.detector import Keypoints
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.matcher import Posterior
-from deltas_nets.network.parallax import depth_sensitivity
 
 
 class Evidence(NamedTuple):
@@ -197,23 +196,19 @@ class Deltas(nn.Module):
             )
             matches, posterior, confidence = matched.matches, matched.posterior, matched.confidence
             points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
-            sensitivity = depth_sensitivity(views, points, matches.mask[:, 1:])
             if self.judge is not None and matched.decision is not None:
-                confidence = self.judge(matched.decision, matches, posterior, points, sensitivity)
+                confidence = self.judge(matched.decision, matches, posterior, points, views)
             depth = points.depth[:, 0]
             near, far = 0.5 * depth_range[0], 2 * depth_range[1]
-            sparse, doubt = (
-                rasterize_depth(
-                    keypoints.pixels,
-                    values,
-                    image_size=image_size,
-                    mask=points.valid & (depth > near) & (depth < far),
-                    weights=confidence,
-                    reduce="mean",
-                )
-                for values in (depth, sensitivity.error_per_pixel)
+            sparse = rasterize_depth(
+                keypoints.pixels,
+                depth,
+                image_size=image_size,
+                mask=points.valid & (depth > near) & (depth < far),
+                weights=confidence,
+                reduce="mean",
             )
-        dense = self.densifier(features, sparse, doubt)
+        dense = self.densifier(features, sparse)
 
         full = dense.log_depth[0].exp()
         # A Laplace distribution deviates by sqrt(2) of its scale.

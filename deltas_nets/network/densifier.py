@@ -60,7 +60,7 @@ def interpolate_sparse(
     its weight carries and takes the rest from the next coarser level (push).
 
     Args:
-        sparse: ``(B, 1, H, W)`` depth, or another positive quantity in its place.
+        sparse: ``(B, 1, H, W)``.
         stride: of the result.
         fallback: depth where the image holds no point at all, metres.
 
@@ -125,29 +125,16 @@ class Densifier(nn.Module):
         self.spread = nn.Conv2d(half, 1, 3, padding=1)
         self.calibration = SpreadCalibration()
         self.upsampling = ConvexUpsampling(half)
-        # How well the views tell depth here, for the depth and for its spread: no change at first.
-        self.enter_doubt = zero_initialised(nn.Conv2d(1, half, 3, padding=1))
-        self.spread_doubt = nn.Sequential(
-            ConvBlock(half + 6, half), zero_initialised(nn.Conv2d(half, 1, 3, padding=1))
-        )
 
-    def forward(self, features: Features, sparse: SparseDepth, doubt: SparseDepth) -> DenseDepth:
-        """Densify sparse depth of the anchor.
+    def forward(self, features: Features, sparse: SparseDepth) -> DenseDepth:
+        """Densify ``(B, 1, H, W)`` sparse depth of the anchor.
 
         Depth is predicted at 1/2, 1/4, 1/8 and 1/16; that at 1/2 is given, and supervised, as
         upsampled to the image.
-
-        Args:
-            features: of all views.
-            sparse: ``(B, 1, H, W)`` depth of the points.
-            doubt: ``(B, 1, H, W)`` in its place the relative error of depth that one pixel gives.
         """
         anchor = features.of_anchor()
         known = interpolate_sparse(sparse)
-        # Most are between e^-6 and e^-2.
-        doubtful = interpolate_sparse(doubt, fallback=0.02).log_depth / 2 + 2
-        entered = self.enter(torch.cat(known, dim=1)) + self.enter_doubt(doubtful)
-        x4 = self.down4(torch.cat([entered, anchor.quarter], dim=1))
+        x4 = self.down4(torch.cat([self.enter(torch.cat(known, dim=1)), anchor.quarter], dim=1))
         x8 = self.join8(torch.cat([self.down8(x4), anchor.eighth], dim=1))
         x16 = self.join16(torch.cat([self.down16(x8), anchor.sixteenth], dim=1))
         y8 = self.up8(torch.cat([upsample_like(x16, x8), x8], dim=1))
@@ -163,9 +150,7 @@ class Densifier(nn.Module):
             torch.cat([upsample_like(y4, anchor.half), anchor.half, anchor.fine, base], dim=1)
         )
         half = base + self.correct[0](y2).float()
-        clues = upsample_like(torch.cat([*known, doubtful], dim=1), y2)
-        correction = self.spread_doubt(torch.cat([y2, clues], dim=1))
-        log_spread = (self.spread(y2) + correction).float().clamp(-6, 2)
+        log_spread = self.spread(y2).float().clamp(-6, 2)
         logits = self.upsampling(y2)
         # The last cell of an odd side reaches beyond the image.
         height, width = sparse.depth.shape[-2:]

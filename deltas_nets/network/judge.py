@@ -8,11 +8,11 @@ point must not be moved to look right.
 import torch
 from torch import Tensor, nn
 
-from deltas_geom import Matches, Triangulation
+from deltas_geom import Matches, PosedViews, Triangulation
 from deltas_geom.homogeneous import safe_divide
 from deltas_nets.network.context import WIDTH
 from deltas_nets.network.matcher import Decision, Posterior
-from deltas_nets.network.parallax import Sensitivity
+from deltas_nets.network.parallax import parallax_of, relative_error_per_pixel
 
 NUM_CLUES = 14
 
@@ -38,7 +38,7 @@ class Judge(nn.Module):
         matches: Matches,
         posterior: Posterior,
         points: Triangulation,
-        sensitivity: Sensitivity,
+        views: PosedViews,
     ) -> Tensor:
         """Confidence ``(B, N)``, 0 where no source can see the point at any depth.
 
@@ -47,12 +47,12 @@ class Judge(nn.Module):
             matches: as they were triangulated, ``(B, V, N)``.
             posterior: of the matcher.
             points: triangulated from the matches.
-            sensitivity: of the points.
+            views: ``(B, V)``.
         """
         clues = torch.cat(
             [
                 decision.evidence.detach(),
-                of_triangulation(decision, matches, points, sensitivity),
+                of_triangulation(decision, matches, points, views),
                 of_refinement(decision, matches),
                 of_posterior(posterior, window=self.window),
             ],
@@ -66,7 +66,7 @@ class Judge(nn.Module):
 
 @torch.no_grad()
 def of_triangulation(
-    decision: Decision, matches: Matches, points: Triangulation, sensitivity: Sensitivity
+    decision: Decision, matches: Matches, points: Triangulation, views: PosedViews
 ) -> Tensor:
     """Do the rays meet, at a good angle, where the matcher expected it? ``(B, N, 5)``, bounded.
 
@@ -77,12 +77,13 @@ def of_triangulation(
     count = used.sum(dim=1)
     variance = matches.covariance[:, 1:].diagonal(dim1=-2, dim2=-1).mean(dim=-1)  # px^2
     deviation = _mean(variance, used, count).clamp(1e-2, 1e2).sqrt()
-    relative = deviation * sensitivity.error_per_pixel
+    parallax = parallax_of(views, points, used)
+    relative = deviation * relative_error_per_pixel(views, parallax)
     ratio = (points.depth[:, 0] * decision.inv_depth).clamp(0.1, 10.0)
     return torch.stack(
         [
             points.residual.clamp(1e-2, 1e2).log10(),
-            sensitivity.parallax.clamp(1e-3, 1.0).log10() + 1,
+            parallax.clamp(1e-3, 1.0).log10() + 1,
             relative.clamp(1e-4, 1.0).log10() + 2,
             torch.where(points.valid, ratio, 10.0).log().abs(),
             points.valid.to(ratio.dtype),

@@ -155,11 +155,8 @@ class PaperDensifier(nn.Module):
         self.spread = nn.Conv2d(widths[3], 1, 1)
         self.calibration = SpreadCalibration()
 
-    def forward(self, features: ViewTaps, sparse: SparseDepth, doubt: SparseDepth) -> DenseDepth:
-        """Densify ``(B, 1, H, W)`` sparse depth of the anchor.
-
-        The paper's network is not told how well the views tell depth: ``doubt`` is not used.
-        """
+    def forward(self, features: ViewTaps, sparse: SparseDepth) -> DenseDepth:
+        """Densify ``(B, 1, H, W)`` sparse depth of the anchor."""
         maps = self.net.maps(features.of_anchor(), sparse.depth)
         depths = (depth.float() for depth in self.net.decoder.depths(maps))
         return DenseDepth(tuple(depths), self.spread(maps.half).float().clamp(-6, 2))

@@ -1,7 +1,5 @@
 """How well the views' positions tell a depth: what an error of one pixel in the matches does."""
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -9,24 +7,6 @@ from torch import Tensor
 from deltas_geom import PosedViews, Triangulation
 
 SMALLEST = 1e-4  # rad
-
-
-class Sensitivity(NamedTuple):
-    """Of the depth of N points to their matches.
-
-    Attributes:
-        parallax: ``(B, N)`` rad, from :func:`parallax_of`.
-        error_per_pixel: ``(B, N)`` from :func:`relative_error_per_pixel`.
-    """
-
-    parallax: Tensor
-    error_per_pixel: Tensor
-
-
-def depth_sensitivity(views: PosedViews, points: Triangulation, used: Tensor) -> Sensitivity:
-    """Both of triangulated points; arguments as for :func:`parallax_of`."""
-    parallax = parallax_of(views, points, used)
-    return Sensitivity(parallax, relative_error_per_pixel(views, parallax))
 
 
 @torch.no_grad()

@@ -214,7 +214,7 @@ def test_the_finest_map_is_as_large_as_the_image(
     empty = torch.zeros(1, 1, height, width)
     with torch.no_grad():
         features = encoder(torch.rand(1, 1, 3, height, width))
-        dense = densifier(features, SparseDepth(empty, empty), SparseDepth(empty, empty))
+        dense = densifier(features, SparseDepth(empty, empty))
     assert dense.log_depth[0].shape == dense.log_spread.shape == (1, 1, height, width)
     sizes = [scale.shape[-2:] for scale in dense.log_depth[1:]]
     assert sizes == [(-(-height // stride), -(-width // stride)) for stride in (4, 8, 16)]
@@ -226,8 +226,6 @@ def test_doubt_does_not_move_the_edges_of_depth() -> None:
     densifier = Densifier(WIDTHS)
     features = Encoder()(torch.rand(1, 1, 3, 48, 64))
     empty = torch.zeros(1, 1, 48, 64)
-    densifier(
-        features, SparseDepth(empty, empty), SparseDepth(empty, empty)
-    ).log_spread.sum().backward()
+    densifier(features, SparseDepth(empty, empty)).log_spread.sum().backward()
     assert all(parameter.grad is None for parameter in densifier.upsampling.parameters())
     assert all(parameter.grad is not None for parameter in densifier.spread.parameters())

@@ -15,7 +15,6 @@ from deltas_nets.data.synthetic import render_room
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.judge import Judge, of_posterior, of_refinement, of_triangulation
 from deltas_nets.network.matcher import Decision, Matched, Posterior
-from deltas_nets.network.parallax import Sensitivity, depth_sensitivity
 
 SIZE = (64, 96)
 
@@ -27,7 +26,6 @@ class Case(NamedTuple):
     matches: Matches
     posterior: Posterior
     points: Triangulation
-    sensitivity: Sensitivity
     views: PosedViews
 
 
@@ -42,17 +40,6 @@ def model() -> Deltas:
     return Deltas(NetworkConfig(detector=DetectorConfig(num_keypoints=64))).eval()
 
 
-def case_with(
-    decision: Decision,
-    matches: Matches,
-    posterior: Posterior,
-    points: Triangulation,
-    views: PosedViews,
-) -> Case:
-    sensitivity = depth_sensitivity(views, points, matches.mask[:, 1:])
-    return Case(decision, matches, posterior, points, sensitivity, views)
-
-
 def case_of(model: Deltas, room: PosedImages, order: tuple[int, ...] = (0, 1, 2, 3)) -> Case:
     """The room as an untrained network sees it: right, wrong and unseen points."""
     views = PosedViews(*(tensor[None, list(order)] for tensor in room.views))
@@ -64,7 +51,7 @@ def case_of(model: Deltas, room: PosedImages, order: tuple[int, ...] = (0, 1, 2,
     matches = found.matches
     points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
     assert found.decision is not None
-    return case_with(found.decision, matches, found.posterior, points, views)
+    return Case(found.decision, matches, found.posterior, points, views)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +71,7 @@ def taught() -> Judge:
 def clues_of(case: Case) -> Tensor:
     return torch.cat(
         [
-            of_triangulation(case.decision, case.matches, case.points, case.sensitivity),
+            of_triangulation(case.decision, case.matches, case.points, case.views),
             of_refinement(case.decision, case.matches),
             of_posterior(case.posterior, window=2),
         ],
@@ -94,7 +81,7 @@ def clues_of(case: Case) -> Tensor:
 
 def test_it_starts_with_no_correction(model: Deltas, room: PosedImages, case: Case) -> None:
     with torch.no_grad():
-        confidence = Judge(window=2)(*case[:-1])
+        confidence = Judge(window=2)(*case)
         prediction = model(room.images.float() / 255, room.views)
     before = torch.where(case.decision.seen, case.decision.logit.sigmoid(), 0.0)
     assert torch.equal(confidence, before)
@@ -118,8 +105,8 @@ def test_a_correction_changes_confidence_alone(
 def test_the_order_of_sources_changes_nothing(model: Deltas, room: PosedImages) -> None:
     judge = taught()
     with torch.no_grad():
-        straight = judge(*case_of(model, room)[:-1])
-        turned = judge(*case_of(model, room, (0, 3, 1, 2))[:-1])
+        straight = judge(*case_of(model, room))
+        turned = judge(*case_of(model, room, (0, 3, 1, 2)))
     torch.testing.assert_close(turned, straight, rtol=0, atol=1e-3)
 
 
@@ -148,7 +135,7 @@ def test_clues_are_bounded_whatever_happens(
     )
     stages = tuple(size * stage.sign() for stage in case.posterior.stages)
     posterior = case.posterior._replace(stages=stages)
-    clues = clues_of(case_with(decision, matches, posterior, points, case.views))
+    clues = clues_of(Case(decision, matches, posterior, points, case.views))
     assert clues.isfinite().all()
     assert (clues.abs() <= 10).all()
 
@@ -160,7 +147,7 @@ def test_points_that_no_source_sees_have_no_confidence(case: Case) -> None:
     decision = case.decision._replace(seen=nowhere)
     decision.embedding.requires_grad_()
     judge = taught()
-    confidence = judge(*case_with(decision, matches, case.posterior, points, case.views)[:-1])
+    confidence = judge(decision, matches, case.posterior, points, case.views)
     assert (confidence == 0).all()
     confidence.sum().backward()
     gradients = [parameter.grad for parameter in judge.parameters()]
@@ -174,7 +161,7 @@ def test_no_gradient_passes_through_clues_to_descriptors(model: Deltas, room: Po
         logit=case.decision.logit.detach(), embedding=case.decision.embedding.detach()
     )
     judge = taught()
-    confidence = judge(cut, *case[1:-1])
+    confidence = judge(cut, *case[1:])
     judged = [parameter.grad for parameter in judge.parameters()]
     assert judged == [None] * 4
     confidence.square().sum().backward()
@@ -185,7 +172,7 @@ def test_no_gradient_passes_through_clues_to_descriptors(model: Deltas, room: Po
 def test_the_embedding_learns_to_tell_about_confidence(model: Deltas, room: PosedImages) -> None:
     case = case_of(model, room)
     embedding, logit = case.decision.embedding, case.decision.logit
-    confidence = taught()(*case[:-1])
+    confidence = taught()(*case)
     gradients = torch.autograd.grad(confidence.square().sum(), [embedding, logit])
     assert all(gradient.abs().max() > 0 for gradient in gradients)
 
@@ -193,12 +180,12 @@ def test_the_embedding_learns_to_tell_about_confidence(model: Deltas, room: Pose
 def test_rays_that_meet_where_it_was_decided_are_as_expected(case: Case) -> None:
     decided = torch.where(case.points.valid, 1 / case.points.depth[:, 0].clamp_min(1e-3), 1.0)
     decision = case.decision._replace(inv_depth=decided)
-    clues = of_triangulation(decision, case.matches, case.points, case.sensitivity)
+    clues = of_triangulation(decision, case.matches, case.points, case.views)
     assert case.points.valid.any()
     assert (clues[..., 3][case.points.valid] < 1e-4).all()
     torch.testing.assert_close(clues[..., 4], case.points.valid.float())
     twice = of_triangulation(
-        decision._replace(inv_depth=2 * decided), case.matches, case.points, case.sensitivity
+        decision._replace(inv_depth=2 * decided), case.matches, case.points, case.views
     )
     expected = torch.full_like(twice[..., 3], 2).log()[case.points.valid]
     torch.testing.assert_close(twice[..., 3][case.points.valid], expected, rtol=1e-4, atol=1e-4)
@@ -211,8 +198,7 @@ def test_the_parallax_is_that_of_the_widest_source(case: Case) -> None:
     alone = triangulate(case.views.proj, one.pixels, one.weights, one.mask)
     valid = alone.valid & (alone.parallax > 2e-3) & (alone.parallax < 0.2)
     assert valid.sum() > 10
-    sensitivity = depth_sensitivity(case.views, alone, one.mask[:, 1:])
-    clues = of_triangulation(case.decision, one, alone, sensitivity)
+    clues = of_triangulation(case.decision, one, alone, case.views)
     torch.testing.assert_close(
         clues[..., 1][valid], alone.parallax.log10()[valid] + 1, rtol=0, atol=2e-3
     )
