@@ -140,7 +140,9 @@ def test_labels_are_the_teachers_of_the_anchors_in_their_own_light(
     monkeypatch.setattr(step_module, "training_losses", spy)
     train(tmp_path / "run", config, Start(teacher=files[layout]), stop=1)
     with monkeypatch.context() as patch:
-        patch.setattr("deltas_nets.data.augment.Photometry.forward", lambda _, images, seed: images)
+        patch.setattr(
+            "deltas_nets.data.augment.Photometry.forward", lambda _, images, seed, **place: images
+        )
         anchors = first_batch(config).images[:, 0]
     teacher = load_superpoint(files[layout])
     expected = soft_labels(teacher(anchors))
