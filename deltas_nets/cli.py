@@ -188,7 +188,7 @@ class Evaluate(_Prediction):
     """Instead of a capture: the first N, at most 500, of the procedural rooms that neither training
     nor calibration sees, at --work-size, 288 384 if not given."""
     conditions: Literal["ideal", "real"] = "real"
-    """Of rooms: ideal is as rendered, real has the blur, noise and pose errors of training."""
+    """Of rooms: ideal is as rendered, real has blur, noise and usual pose errors."""
     view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen if not given."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
@@ -321,7 +321,10 @@ def _parse(arguments: list[str]) -> Command:
             raise
         # tyro draws a box; what it says fits a line.
         words = re.sub(r"\[/?bold\]|[─│╭╮╰╯]", " ", said.getvalue()).split()
-        _fail(UserError(" ".join(words)[:200], "command line", _help_of(arguments)))
+        # What a config inside the config refused comes with tyro's name for where it is.
+        refused = re.fullmatch(r"Value error Error parsing \S+: (.*) For full.*", " ".join(words))
+        what = refused[1] if refused else " ".join(words)
+        _fail(UserError(what[:200], "command line", _help_of(arguments)))
     return command
 
 

@@ -35,7 +35,8 @@ class Export:
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
     refinement: int = 8
-    """Depths searched per sample, at most: wide baselines need up to 8, which takes longer."""
+    """Samples in each bin of inverse depth. The network takes 8 at most; fewer are faster, and
+    coarser where views are far apart."""
     overwrite: Flag = False
     """Replace --out if it exists."""
     debug: Flag = False

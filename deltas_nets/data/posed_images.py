@@ -1,5 +1,6 @@
 """Images, where they were taken from, and how far away what they show is."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
@@ -16,3 +17,13 @@ class PosedImages(NamedTuple):
     """Cameras of the images: K ``(*B, V, 3, 3)``, cam_from_world ``(*B, V, 4, 4)``."""
     depth: Tensor
     """``(*B, V, H, W)`` metres along z at the pixel centres; 0 where unknown."""
+
+    def tensors(self) -> list[Tensor]:
+        """Images, K, cam_from_world and depth."""
+        return [self.images, *self.views, self.depth]
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> "PosedImages":
+        """Every tensor changed alike."""
+        return PosedImages(
+            change(self.images), PosedViews(*map(change, self.views)), change(self.depth)
+        )

@@ -232,17 +232,9 @@ def step_loader(
         if isinstance(rooms, UserError):
             raise rooms
         if rooms is not None:
-            shelves.put(_to_device(rooms, device), step)
+            shelves.put(rooms.map(lambda tensor: tensor.to(device)), step)
         if step >= start:
             yield shelves.take(step)
-
-
-def _to_device(rooms: PosedImages, device: torch.device | str) -> PosedImages:
-    return PosedImages(
-        rooms.images.to(device),
-        PosedViews(*(tensor.to(device) for tensor in rooms.views)),
-        rooms.depth.to(device),
-    )
 
 
 def room_loader(

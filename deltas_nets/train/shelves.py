@@ -6,13 +6,10 @@ another anchor, with other sources, in another light. Since shelves belong to pl
 sees does not depend on which process holds which places.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from deltas_geom import PosedViews
 from deltas_nets.data.posed_images import PosedImages
 
 
@@ -51,9 +48,9 @@ class Shelves:
         shelves = [place - self.places.start for place in new]
         slots = [(self._given(place, step) - 1) % self.depth for place in new]
         if self._rooms is None:
-            self._rooms = _map(self._empty, rooms)
-        for place, slot, *fresh in zip(shelves, slots, *_tensors(rooms), strict=True):
-            for kept, room in zip(_tensors(self._rooms), fresh, strict=True):
+            self._rooms = rooms.map(self._empty)
+        for place, slot, *fresh in zip(shelves, slots, *rooms.tensors(), strict=True):
+            for kept, room in zip(self._rooms.tensors(), fresh, strict=True):
                 kept[place, slot].copy_(room)
 
     def take(self, step: int) -> PosedImages:
@@ -67,9 +64,8 @@ class Shelves:
             for draw, place in zip(draws, self.places, strict=True)
         ]
         # Row by row, without an index on the device to wait for.
-        return _map(
-            lambda kept: torch.stack([row[slot] for row, slot in zip(kept, slots, strict=True)]),
-            self._rooms,
+        return self._rooms.map(
+            lambda kept: torch.stack([row[slot] for row, slot in zip(kept, slots, strict=True)])
         )
 
     def _given(self, place: int, step: int) -> int:
@@ -79,13 +75,3 @@ class Shelves:
 
     def _empty(self, rooms: Tensor) -> Tensor:
         return rooms.new_zeros(len(self.places), self.depth, *rooms.shape[1:])
-
-
-def _tensors(rooms: PosedImages) -> list[Tensor]:
-    return [rooms.images, *rooms.views, rooms.depth]
-
-
-def _map(change: Callable[[Tensor], Tensor], rooms: PosedImages) -> PosedImages:
-    return PosedImages(
-        change(rooms.images), PosedViews(*map(change, rooms.views)), change(rooms.depth)
-    )

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom import Samples, ShapeError, correlate, correlate_normalized, sample_map
+from deltas_geom import (
+    Samples,
+    ShapeError,
+    correlate,
+    correlate_normalized,
+    correlation,
+    sample_map,
+)
 from deltas_geom.testing.strategies import image_pixels, vectors
 
 SIZE = (24, 32)  # of the image, px; the map has stride 4
@@ -242,6 +249,32 @@ def test_pieces_of_any_size_make_the_whole(
     monkeypatch.setattr("deltas_geom.correlation._CACHED_ELEMENTS", limit)
     for piece, expected in zip(outcome(), whole, strict=True):
         assert_close(piece, expected, rtol=0, atol=1e-11)
+
+
+@given(
+    st.lists(st.integers(1, 4), max_size=2),
+    st.integers(1, 60),
+    st.integers(1, 9),
+    st.integers(1, 9),
+)
+def test_no_piece_holds_more_than_the_limit(
+    batch: list[int], count: int, elements: int, tens: int
+) -> None:
+    """But for the fewest keypoints that are worth a call."""
+    held = []
+
+    def record(maps: Tensor, keypoints: Tensor) -> Tensor:
+        held.append(keypoints.numel() * elements)
+        return keypoints
+
+    keypoints = torch.rand(*batch, count)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(correlation, "_CACHED_ELEMENTS", 10 * tens)
+        whole = correlation._in_pieces(
+            record, torch.zeros(*batch, 3, 1, 1), keypoints, elements=elements
+        )
+    assert torch.equal(whole, keypoints)
+    assert max(held) <= max(10 * tens, 16 * elements)
 
 
 @BOTH

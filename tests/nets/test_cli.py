@@ -271,6 +271,17 @@ def test_wrong_options_are_one_line(run: Run, make_capture: MakeCapture, tmp_pat
     assert not out.exists()
 
 
+def test_what_a_config_refuses_is_said_in_its_own_words(run: Run, tmp_path: Path) -> None:
+    for options, words in (
+        (["--network.detector.num-keypoints", "2"], "num_keypoints must be at least 8, got 2"),
+        (["--data.shelf", "0"], "replay and shelf must be at least 1, got 1 and 0"),
+        (["--data.replay", "5"], "batch_size must be a multiple of data.replay, got 6 and 5"),
+    ):
+        told = run("train", "--out", tmp_path / "run", *options)
+        assert_one_line(told, f"deltas: {words}, command line: see deltas train --help")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_file_is_no_output_folder(run: Run, make_capture: MakeCapture, tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("mine")
