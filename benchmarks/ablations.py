@@ -3,7 +3,7 @@
 python benchmarks/ablations.py --cache DIR [--only NAME ...] [--steps 300] [--results FILE]
 
 All variants see the same rooms in the same order from the same seed, and are scored on rooms that
-no training uses, three views each, in the light and with the pose errors of training. The one with
+no training uses, three views each, with the usual blur, noise and pose errors. The one with
 another seed says how far chance alone moves a score. A variant is appended to the results once it
 is done; the same command then skips it, and prints the table of all.
 """
