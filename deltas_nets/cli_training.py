@@ -13,6 +13,7 @@ from deltas_nets.errors import UserError
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Network = Literal["deltas-small", "deltas-resnet50", "deltas-vgg9"]
 NETWORKS: tuple[Network, ...] = ("deltas-small", "deltas-resnet50", "deltas-vgg9")
+Measured = Literal[Network, "reference"]
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,9 @@ class Cost:
     Example: deltas cost deltas-small --views 3
     """
 
-    networks: tyro.conf.Positional[tuple[Network, ...]] = NETWORKS
-    """Which ones."""
+    networks: tyro.conf.Positional[tuple[Measured, ...]] = (*NETWORKS, "reference")
+    """Which ones, with random weights; reference is the network that the paper's authors
+    published."""
     views: int = 2
     """Views, the anchor included."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (240, 320)
@@ -124,12 +126,17 @@ class Cost:
         from deltas_nets.cost.command import run_cost
         from deltas_nets.network.deltas import Deltas
         from deltas_nets.outputs import check_writable
+        from deltas_nets.reference import ReferenceNetwork
 
         if self.json is not None:
             check_writable(self.json.parent)
         device = usable_device(self.device)
+        networks = {
+            name: ReferenceNetwork() if name == "reference" else Deltas(CONFIGS[name])
+            for name in self.networks
+        }
         run_cost(
-            {name: Deltas(CONFIGS[name]).to(device).eval() for name in self.networks},
+            {name: network.to(device).eval() for name, network in networks.items()},
             num_views=self.views,
             image_size=self.size,
             num_keypoints=self.num_keypoints,

@@ -13,6 +13,8 @@ from deltas_nets.cost.literature import PAPER_SETTING
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
 from deltas_nets.errors import UserError
+from deltas_nets.network.detector import CELL
+from deltas_nets.reference import ReferenceNetwork
 from deltas_nets.terminal import warn
 
 MIN_SIDE = 32
@@ -31,7 +33,7 @@ def run_cost(
     """Print what each network costs, and beside the paper's figures if the setting is the paper's.
 
     Args:
-        models: by name, called as `Deltas` is.
+        models: by name, called as `Deltas` is, or the published network.
         num_views: the anchor and its sources.
         image_size: (height, width).
         num_keypoints: points to triangulate.
@@ -48,11 +50,17 @@ def run_cost(
             "command line",
             f"ask for 2 views, {MIN_SIDE} pixels, 1 keypoint and 1 run or more",
         )
-    console = Console()
     height, width = image_size
+    fitting = {name: model for name, model in models.items() if _takes(model, image_size)}
+    for name in models.keys() - fitting.keys():
+        left_out = f"{name} takes multiples of {CELL}, not {height} x {width}"
+        if not fitting:
+            raise UserError(left_out, "command line", "change --size, or name other networks")
+        warn(f"{left_out}: left out")
+    console = Console()
     setting = f"{num_views} views, {height} x {width}, {num_keypoints} keypoints"
     costs = {}
-    for name, model in models.items():
+    for name, model in fitting.items():
         cost = costs[name] = cost_of(model, num_views, image_size, num_keypoints, repeats=repeats)
         console.print(cost_table(cost, title=f"{name}: {setting}"))
         console.print(
@@ -65,7 +73,7 @@ def run_cost(
     if (num_views, image_size, num_keypoints) == PAPER_SETTING:
         console.print(comparison_table(costs))
     if json is not None:
-        devices = {name: device_name(model) for name, model in models.items()}
+        devices = {name: device_name(model) for name, model in fitting.items()}
         write_json(
             json,
             {
@@ -78,6 +86,11 @@ def run_cost(
                 **costs_as_json(costs),
             },
         )
+
+
+def _takes(model: nn.Module, image_size: tuple[int, int]) -> bool:
+    """The published network has no rule for cells that leave the image."""
+    return not (isinstance(model, ReferenceNetwork) and any(side % CELL for side in image_size))
 
 
 def device_name(model: nn.Module) -> str:

@@ -11,9 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
+from deltas_geom.poses import relative_pose
 from deltas_nets.cost.memory import PeakMemory
 from deltas_nets.cost.operations import Flops, OperationCounter
 from deltas_nets.cost.stages import GEOMETRY, followed_stages, parameters_by_stage, stage_names
+from deltas_nets.reference import ReferenceNetwork
 
 
 class StageCost(NamedTuple):
@@ -57,7 +59,7 @@ def cost_of(
     """Cost of one anchor's depth, without gradients, where the model is.
 
     Args:
-        model: called as `Deltas` is; its children are its stages.
+        model: called as `Deltas` is, or the published network; its children are its stages.
         num_views: the anchor and its sources.
         image_size: (height, width).
         num_keypoints: points to triangulate.
@@ -66,9 +68,7 @@ def cost_of(
     images, views = posed_noise(num_views, image_size=image_size)
     weight = next(model.parameters())
     images, views = images.to(weight), PosedViews(*(tensor.to(weight) for tensor in views))
-    return cost_of_run(
-        model, lambda: model(images, views, num_keypoints=num_keypoints), repeats=repeats
-    )
+    return cost_of_run(model, _pass_of(model, images, views, num_keypoints), repeats=repeats)
 
 
 def cost_of_run(model: nn.Module, run: Callable[[], object], *, repeats: int = 5) -> Cost:
@@ -126,6 +126,24 @@ def posed_noise(num_views: int, *, image_size: tuple[int, int]) -> tuple[Tensor,
     cam_from_world = torch.eye(4).repeat(num_views, 1, 1)
     cam_from_world[:, 0, 3] = -0.1 * torch.arange(num_views)
     return images, PosedViews(K.repeat(num_views, 1, 1), cam_from_world)
+
+
+def _pass_of(
+    model: nn.Module, images: Tensor, views: PosedViews, num_keypoints: int
+) -> Callable[[], object]:
+    """What is measured: from images to depth, as each network is called."""
+    if not isinstance(model, ReferenceNetwork):
+        return lambda: model(images, views, num_keypoints=num_keypoints)
+    anchor, sources = views.cam_from_world[:1], views.cam_from_world[1:]
+    cam_from_anchor = relative_pose(sources, anchor)[None]
+
+    def run() -> object:
+        generator = torch.Generator().manual_seed(0)  # random keypoints, the same in each run
+        return model.predict(
+            images, views.K[:1], cam_from_anchor, num_points=num_keypoints, generator=generator
+        )
+
+    return run
 
 
 def _counted(model: nn.Module, run: Callable[[], object]) -> OperationCounter:

@@ -2,22 +2,25 @@
 
 from typing import NamedTuple
 
-from deltas_nets.config import NetworkConfig
+from deltas_nets.config import MatcherConfig, NetworkConfig
 from deltas_nets.network.densifier import Densifier
 from deltas_nets.network.descriptor import Descriptor
 from deltas_nets.network.detector import Detector
 from deltas_nets.network.encoder import Encoder
 from deltas_nets.network.judge import Judge
-from deltas_nets.network.matcher import Matcher, build_matcher
+from deltas_nets.network.matcher import JointMatcher
 from deltas_nets.network.paper import (
     PaperDensifier,
     PaperDescriptor,
     PaperDetector,
     PaperEncoder,
 )
+from deltas_nets.network.per_view_matcher import PerViewMatcher
 from deltas_nets.network.resnet import ResNet50
 from deltas_nets.network.taps import Backbone
 from deltas_nets.network.vgg import VGG9
+
+Matcher = JointMatcher | PerViewMatcher
 
 
 class Stages(NamedTuple):
@@ -57,6 +60,15 @@ def build_stages(config: NetworkConfig) -> Stages:
         None,  # a point's confidence is its matches' weight
         PaperDensifier(sparse, image.channels, _five(config.densifier_widths)),
     )
+
+
+def build_matcher(config: MatcherConfig, descriptor_dim: int) -> Matcher:
+    """The matcher a config names."""
+    kinds: dict[str, type[JointMatcher] | type[PerViewMatcher]] = {
+        "joint": JointMatcher,
+        "per_view": PerViewMatcher,
+    }
+    return kinds[config.kind](config, descriptor_dim)
 
 
 def _four(widths: tuple[int, ...]) -> tuple[int, int, int, int]:

@@ -1,8 +1,8 @@
-"""From keypoints to matches: the paper's matcher and the joint one.
+"""From keypoints to matches: what a matcher returns, and the joint one.
 
-Both return matches that go straight into triangulation, the posterior they come from, and one
-confidence per point. The joint matcher first finds the depth on which all views agree, then
-lets every view move its match a little towards what it sees.
+Matches go straight into triangulation, with the posterior they come from and one confidence per
+point. The joint matcher first finds the depth on which all views agree, then lets every view
+move its match a little towards what it sees. The paper's is in `per_view_matcher`.
 """
 
 from typing import NamedTuple
@@ -15,11 +15,8 @@ from deltas_geom import (
     Matches,
     PosedViews,
     correlate,
-    epipolar_segments,
-    match_per_view,
     sample_inv_depths,
     sample_map,
-    sample_segments,
     soft_argmax,
 )
 from deltas_geom.matching import matches_at
@@ -128,7 +125,7 @@ class JointMatcher(nn.Module):
         places = subdivide(centres, counts, most if refinement else int(counts.max()))
         each = places.flatten(1)[:, None].expand(-1, keypoints.shape[1], -1)
         samples = sample_inv_depths(views, keypoints, each, image_size=image_size)
-        anchor = _at_keypoints(descriptors, keypoints, image_size)
+        anchor = at_keypoints(descriptors, keypoints, image_size)
         correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
         seen = samples.mask.squeeze(-2)
         bins = best_of_bins(*self._fused(correlation.squeeze(-2), seen), places, centres)
@@ -179,62 +176,8 @@ class JointMatcher(nn.Module):
         return torch.where(seen.any(dim=1), fused, -0.2), seen.float().mean(dim=1)
 
 
-class PerViewMatcher(nn.Module):
-    """The paper's: each source decides alone, weighted DLT reconciles them."""
-
-    def __init__(self, config: MatcherConfig, descriptor_dim: int) -> None:
-        super().__init__()
-        self.config = config
-        self.norm = nn.BatchNorm1d(1)
-        self.log_scale = nn.Parameter(torch.tensor(2.0))
-
-    def forward(
-        self,
-        keypoints: Tensor,
-        descriptors: Descriptors,
-        views: PosedViews,
-        *,
-        image_size: tuple[int, int],
-        depth_range: tuple[float, float],
-        refinement: int | None = None,
-    ) -> Matched:
-        """Match ``(B, N, 2)`` keypoints of the anchor in each source alone.
-
-        There is no ``refinement``: each source is searched where it can see the point.
-        """
-        segments = epipolar_segments(
-            views, keypoints, depth_range=depth_range, image_size=image_size
-        )
-        samples = sample_segments(
-            segments, self.config.num_samples, offsets=self.config.offsets, image_size=image_size
-        )
-        anchor = _at_keypoints(descriptors, keypoints, image_size)
-        correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
-        normed = self.norm(correlation.reshape(-1, 1)).view_as(correlation).relu()
-        scores = normed * self.log_scale.exp()
-        matches = match_per_view(keypoints, scores, samples)
-        along = torch.where(samples.mask, scores, torch.finfo(scores.dtype).min / 4)
-        posterior = Posterior(
-            (along.logsumexp(dim=-2),), samples.inv_depth, samples.mask.any(dim=-2)
-        )
-        confidence = torch.where(matches.mask, matches.weights, 0.0)[:, 1:].amax(dim=1)
-        return Matched(matches, confidence, posterior, None)
-
-
-def _at_keypoints(
+def at_keypoints(
     descriptors: Descriptors, keypoints: Tensor, image_size: tuple[int, int]
 ) -> Tensor:
     """Unit descriptors ``(B, N, D)`` of the anchor's keypoints."""
     return F.normalize(sample_map(descriptors.maps[:, 0], keypoints, image_size=image_size), dim=-1)
-
-
-Matcher = JointMatcher | PerViewMatcher
-
-
-def build_matcher(config: MatcherConfig, descriptor_dim: int) -> Matcher:
-    """The matcher a config names."""
-    kinds: dict[str, type[JointMatcher] | type[PerViewMatcher]] = {
-        "joint": JointMatcher,
-        "per_view": PerViewMatcher,
-    }
-    return kinds[config.kind](config, descriptor_dim)

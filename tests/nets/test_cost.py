@@ -21,10 +21,11 @@ from deltas_nets.cost.literature import PAPER_PARTS, PAPER_TOTAL
 from deltas_nets.cost.measure import Cost, cost_of, cost_of_run, posed_noise
 from deltas_nets.cost.memory import PeakMemory
 from deltas_nets.cost.operations import Flops, OperationCounter
-from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
+from deltas_nets.cost.report import PARTS, comparison_table, cost_table, costs_as_json, gmacs
 from deltas_nets.cost.stages import GEOMETRY, followed_stages, parameters_by_stage
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.reference import ReferenceNetwork
 
 SIZE = (96, 128)
 CHILDREN = ["encoder", "detector", "descriptor", "matcher", "judge", "densifier"]
@@ -321,6 +322,31 @@ def test_sources_cost_descriptors_but_no_densification(small: Deltas, cost: Cost
         assert cost.stages[name].flops == fewer[name].flops
 
 
+# Beside the paper: 16.57, below 0.002 and 67.90, with batch norm and without the correlation.
+
+
+@pytest.mark.parametrize(
+    ("build", "detector"),
+    [(ReferenceNetwork, 16.50), (lambda: Deltas(CONFIGS["deltas-resnet50"]), 15.76)],
+    ids=["reference", "deltas-resnet50"],
+)
+def test_the_papers_network_has_the_papers_products(
+    build: Callable[[], nn.Module], detector: float
+) -> None:
+    stages = cost_of(build(), 2, (240, 320), 512, repeats=1).stages
+    found = [
+        gmacs(sum(stages[name].flops.products for name in names if name in stages))
+        for names in PARTS.values()
+    ]
+    assert sum(found) == pytest.approx(
+        gmacs(sum(stage.flops.products for stage in stages.values()))
+    ), "a stage is in no part"
+    assert found[0] == pytest.approx(detector, abs=0.005)
+    # 512 points x 300 samples x 128 channels are 0.0197 of it.
+    assert found[1] == pytest.approx(0.021, abs=0.0015)
+    assert found[2] == pytest.approx(67.86, abs=0.005)
+
+
 # Memory.
 
 
@@ -363,6 +389,14 @@ def test_the_tables_show_every_stage_and_the_papers_figures(cost: Cost) -> None:
     assert "other stages" not in text
 
 
+def test_four_networks_fit_a_terminal(cost: Cost) -> None:
+    names = ("deltas-small", "deltas-resnet50", "deltas-vgg9", "reference")
+    text = printed(comparison_table(dict.fromkeys(names, cost)))
+    assert "\u2026" not in text, "cut off"
+    for word in ("resnet50", "reference", "triangulation", "67.9"):
+        assert word in text
+
+
 def test_stages_of_no_part_of_the_paper_are_shown_apart(cost: Cost) -> None:
     stages = {("pose" if name == "matcher" else name): it for name, it in cost.stages.items()}
     assert "other stages" in printed(comparison_table({"x": cost._replace(stages=stages)}))
@@ -393,6 +427,13 @@ def test_the_command_prints_and_writes(
     assert "MVDepthNet" in capsys.readouterr().out
     with pytest.raises(UserError, match="2 views"):
         run_cost({"net": small}, num_views=1)
+    with pytest.raises(UserError, match="published takes multiples of 8, not 100 x 128"):
+        run_cost({"published": ReferenceNetwork()}, image_size=(100, 128))
+    both = {"published": ReferenceNetwork(), "net": small}
+    run_cost(both, image_size=(100, 128), num_keypoints=64, repeats=1)
+    said = capsys.readouterr()
+    assert "net: 2 views" in said.out and "published:" not in said.out
+    assert "published takes multiples of 8" in said.err
 
 
 def test_the_command_warns_of_what_it_cannot_count(capsys: pytest.CaptureFixture[str]) -> None:
