@@ -19,6 +19,11 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
+from deltas_nets.data.camera_effects import (
+    RandomCornerBlur,
+    RandomRollingExposure,
+    RandomVignetting,
+)
 from deltas_nets.data.posed_images import PosedImages
 
 
@@ -80,11 +85,15 @@ def resize(batch: PosedImages, size: tuple[int, int]) -> PosedImages:
 
 
 class Photometry(nn.Module):
-    """What a camera does to light, differently in every view: kornia's augmentations."""
+    """What a camera does to light, differently in every view: kornia's augmentations and ours."""
 
     def __init__(self) -> None:
         super().__init__()
         self.steps = nn.Sequential(
+            # Lens and shutter come before the curve: what it saturates has no darker corners.
+            RandomCornerBlur(strength=(0.3, 1.0), p=0.2),
+            RandomVignetting(corner=(0.55, 1.0), p=0.4),
+            RandomRollingExposure(amplitude=(0.0, 0.15), periods=(0.5, 3.0), p=0.2),
             RandomGamma(gamma=(0.65, 1.5), gain=(0.65, 1.45), p=1.0),
             RandomRGBShift(0.07, 0.05, 0.07, p=0.7),
             RandomSaturation((0.3, 1.3), p=0.5),
