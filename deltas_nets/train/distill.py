@@ -2,8 +2,9 @@
 
 python -m deltas_nets.train.distill --teacher aliked --teacher-weights aliked-n16.pth --out FILE
 
-The teacher looks once at every picture of a pool, as it is. The student sees it as other cameras
-would have taken it, and learns to find the same points. Its encoder is frozen, so that it runs
+The teacher looks at every picture of a pool from several sides and keeps what it finds from most.
+The student sees the picture as other cameras would have taken it, and learns to find the same
+points. Its encoder is frozen, so that it runs
 once over the pool as well; what is trained is the head on top, in seconds per thousand steps.
 The paper distils from SuperPoint in the same way (section 3.1).
 """
@@ -28,6 +29,7 @@ from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.encoder import Encoder, Features
 from deltas_nets.pretrained import DEFAULT, load_model, read_metadata, save_weights, weights_file
 from deltas_nets.teachers import LICENCES, Teacher, load_teacher
+from deltas_nets.teachers.adaptation import adapted_scores
 from deltas_nets.teachers.labels import hard_labels, soft_labels
 
 IMAGE_SIZE = (192, 256)
@@ -55,6 +57,9 @@ class DistillConfig:
     """At the start; it falls to a hundredth along half a cosine."""
     num_images: int = 1200
     """Pictures that the teacher labels."""
+    adaptation: int = 12
+    """Ways in which the teacher looks at each of them, warped by random homographies: it keeps
+    what it finds from most sides. 1: as it is."""
     looks: int = 2
     """Variants of every picture that the student sees: other light, noise, blur. One takes
     0.35 MB of memory."""
@@ -75,8 +80,11 @@ class DistillConfig:
     """Of everything random."""
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch_size, self.num_images, self.looks) < 1:
-            raise ValueError("steps, batch_size, num_images and looks must be at least 1")
+        least = min(self.steps, self.batch_size, self.num_images, self.looks, self.adaptation)
+        if least < 1:
+            raise ValueError(
+                "steps, batch_size, num_images, looks and adaptation must be at least 1"
+            )
         if not 0 <= self.picture_share <= 1:
             raise ValueError(f"picture_share must be within [0, 1], got {self.picture_share}")
 
@@ -184,7 +192,8 @@ def prepare(
     lessons: list[Lessons] = []
     for number, picture in enumerate(draw_pictures(config)):
         image = picture[None].float() / 255
-        scores = teacher(image).half()
+        random = torch.Generator().manual_seed(config.seed * 1_000_003 + number)
+        scores = adapted_scores(teacher, image, looks=config.adaptation, random=random).half()
         for look in range(config.looks):
             seed = config.seed * 1_000_003 + number * config.looks + look
             seen = photometry(image[:, None], seed)
@@ -264,6 +273,7 @@ def _record(config: DistillConfig, before: dict[str, str]) -> dict[str, str]:
             f"{config.num_images} pictures: views of procedural rooms {FIRST_ROOM}.."
             f"{FIRST_ROOM + NUM_ROOMS}, and crops of photographs of scikit-image"
         ),
+        "detector_adaptation": str(config.adaptation),
         "detector_steps": str(config.steps),
         "detector_seed": str(config.seed),
     }
