@@ -14,8 +14,9 @@ from deltas_nets.errors import UserError
 class Calibrate:
     """Make the standard deviations that weights predict as large as their errors.
 
-    Fits a curve of eight points on procedural rooms that no training sees, shows what it does on
-    others, and writes the weights with it; depth stays the same.
+    Fits curves of eight points, one each for 2, 3, 5 and 8 views, on procedural rooms that no
+    training sees, shows what they do on others, and writes the weights with them; depth stays the
+    same.
 
     Example: deltas calibrate --weights runs/first/weights.safetensors --out mine.safetensors
     """
@@ -25,10 +26,10 @@ class Calibrate:
     weights: str = "deltas-small"
     """A shipped network, or a weights file of `deltas train`."""
     rooms: int = 100
-    """Rooms to fit on, at most 500; half as many are reported on. Errors of a room's pixels go
-    together: with 60 rooms ratios are known to a tenth or a fifth only."""
+    """Rooms to fit each curve on, at most 500; half as many are reported on. Errors of a room's
+    pixels go together: with 60 rooms ratios are known to a tenth or a fifth only."""
     views: int = 3
-    """Views of each, the anchor included."""
+    """Views of the rooms that are reported on, the anchor included."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (288, 384)
     """Of their images: the one that the weights will work at, for standard deviations change with
     it."""
@@ -55,6 +56,7 @@ class Calibrate:
             held_out_rooms,
             measure_rooms,
         )
+        from deltas_nets.network.calibration import VIEWS
         from deltas_nets.outputs import check_writable
         from deltas_nets.pretrained import load_model, read_metadata, save_weights, weights_file
         from deltas_nets.terminal import progress
@@ -66,10 +68,13 @@ class Calibrate:
         held_out = held_out_rooms(
             max(1, self.rooms // 2), EVALUATION_SEEDS, num_views=self.views, image_size=self.size
         )
-        fitted_on = held_out_rooms(
-            self.rooms, CALIBRATION_SEEDS, num_views=self.views, image_size=self.size
-        )
-        with progress("calibrate", len(fitted_on) + 3 * len(held_out)) as report:
+        fitted_on = {
+            views: held_out_rooms(
+                self.rooms, CALIBRATION_SEEDS, num_views=views, image_size=self.size
+            )
+            for views in VIEWS
+        }
+        with progress("calibrate", len(VIEWS) * self.rooms + 3 * len(held_out)) as report:
             shown = []  # rendered once
             for number in range(len(held_out)):
                 shown.append(held_out[number])
@@ -83,7 +88,8 @@ class Calibrate:
         Console().print(calibration_table(after.result(), title=f"{found}, after"))
         print(sparsification_line(after.result()))
         first, size = CALIBRATION_SEEDS.start, "x".join(map(str, self.size))
-        said = f"procedural rooms {first}..{first + self.rooms}, {self.views} views, {size}"
+        counts = ", ".join(map(str, VIEWS))
+        said = f"procedural rooms {first}..{first + self.rooms}, {counts} views, {size}"
         save_weights(self.out, model, metadata | {"calibration": said})
         print(f"weights in {self.out}")
 

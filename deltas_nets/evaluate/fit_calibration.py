@@ -1,15 +1,13 @@
 """Fit the calibration of a network's standard deviations, on rooms that no training sees."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from deltas_nets.evaluate.calibration import Calibration, CalibrationMeter
 from deltas_nets.evaluate.rooms import RoomViews, measure_rooms
-from deltas_nets.network.calibration import NUM_KNOTS
+from deltas_nets.network.calibration import NUM_KNOTS, Curve
 from deltas_nets.network.deltas import Deltas
 
 LEAST_SLOPE = 0.05
@@ -17,13 +15,6 @@ LEAST_SLOPE = 0.05
 pixels is kept all the same."""
 LEAST_STEP = 1e-3
 LEAST_ERROR = 1e-6
-
-
-class Curve(NamedTuple):
-    """What :class:`deltas_nets.network.calibration.SpreadCalibration` takes, ``(8,)`` each."""
-
-    knots: Tensor
-    values: Tensor
 
 
 def fit_curve(meter: CalibrationMeter) -> Curve:
@@ -51,29 +42,32 @@ def fit_curve(meter: CalibrationMeter) -> Curve:
 
 def fit_calibration(
     model: Deltas,
-    rooms: RoomViews,
+    rooms: Mapping[int, RoomViews],
     *,
     depth_range: tuple[float, float] = (0.5, 10.0),
     report: Callable[[str], None] = lambda _: None,
-) -> Calibration:
+) -> dict[int, Calibration]:
     """Calibrate a network in place; an earlier calibration is replaced.
 
     Args:
         model: trained; only its calibration changes.
-        rooms: to fit on. Never those that are reported on, and never real captures, whose
-            figures would no longer say how the network does on captures it has not seen.
+        rooms: to fit on, for each of :data:`deltas_nets.network.calibration.VIEWS` some with so
+            many views. Never those that are reported on, and never real captures, whose figures
+            would no longer say how the network does on captures it has not seen.
         depth_range: (near, far) metres.
         report: called after each room.
 
     Returns:
-        How it was before, on these rooms.
+        How it was before, on these rooms, by number of views.
 
     Raises:
         ValueError: no room has depth in range.
     """
     model.calibration.reset()
-    meter = CalibrationMeter()
-    measure_rooms(model, rooms, meter, depth_range=depth_range, report=report)
-    before = meter.result()
-    model.calibration.set(*fit_curve(meter))
+    before: dict[int, Calibration] = {}
+    for num_views, some in rooms.items():
+        meter = CalibrationMeter()
+        measure_rooms(model, some, meter, depth_range=depth_range, report=report)
+        before[num_views] = meter.result()
+        model.calibration.set(num_views, fit_curve(meter))
     return before

@@ -1,41 +1,38 @@
 """A monotone correction of the predicted standard deviation, fitted after training.
 
 A spread that was learned with the network's own training errors is off where rooms or errors are
-others than in training. A curve of few points, from the log of the predicted standard deviation to
-the log of the right one, mends it; depth, and which pixel is more certain than which, stay.
+others than in training, and it is learned with all numbers of views together. A curve of few
+points for some numbers of views, from the log of the predicted standard deviation to the log of
+the right one, mends both; depth, and which pixel of a map is more certain than which, stay.
 """
 
-from typing import Any
+import math
+from bisect import bisect_right
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+VIEWS = (2, 3, 5, 8)
+"""Numbers of views, the anchor included, that have a curve of their own."""
 NUM_KNOTS = 8
 RANGE = (-6.0, 2.0)
 """Log standard deviations between which the knots of the identity lie."""
 
 
-class SpreadCalibration(nn.Module):
-    """Piecewise linear and increasing; a constant factor beyond the first and the last knot.
+class Curve(NamedTuple):
+    """From predicted to right log standard deviations.
 
     Attributes:
         knots: ``(8,)`` log of predicted relative standard deviations, increasing.
-        values: ``(8,)`` what each becomes, increasing. Both are buffers: no training moves them.
-
-    Weights without them, from before a calibration was fitted, load as the identity.
+        values: ``(8,)`` what each becomes, increasing.
     """
 
     knots: Tensor
     values: Tensor
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("knots", torch.linspace(*RANGE, NUM_KNOTS))
-        self.register_buffer("values", torch.linspace(*RANGE, NUM_KNOTS))
-        self.register_load_state_dict_pre_hook(_identity_if_missing)  # type: ignore[no-untyped-call]
-
-    def forward(self, log_std: Tensor) -> Tensor:
-        """Correct log standard deviations of any shape."""
+    def __call__(self, log_std: Tensor) -> Tensor:
+        """Correct log standard deviations of any shape; beyond the ends by a constant factor."""
         widths = self.knots.diff()
         slopes = self.values.diff() / widths
         # How far each value climbs up each of the segments.
@@ -44,28 +41,79 @@ class SpreadCalibration(nn.Module):
         above = (log_std - self.knots[-1]).clamp_min(0)
         return self.values[0] + (climbed * slopes).sum(dim=-1) + below + above
 
-    def set(self, knots: Tensor, values: Tensor) -> None:
+
+class SpreadCalibration(nn.Module):
+    """One curve for each of ``VIEWS``; between two of them their mean, by the log of the number.
+
+    Attributes:
+        knots: ``(4, 8)`` of the curves.
+        values: ``(4, 8)``. Both are buffers: no training moves them.
+
+    Weights with one curve for any number of views load as four of it; those without any, from
+    before a calibration was fitted, as the identity.
+    """
+
+    knots: Tensor
+    values: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("knots", _identity())
+        self.register_buffer("values", _identity())
+        self.register_load_state_dict_pre_hook(_of_older_weights)  # type: ignore[no-untyped-call]
+
+    def forward(self, log_std: Tensor, num_views: int) -> Tensor:
+        """Correct log standard deviations of any shape, predicted from so many views."""
+        return self.curve(num_views)(log_std)
+
+    def curve(self, num_views: int) -> Curve:
+        """The curve for a number of views; beyond those of ``VIEWS``, that of the nearest."""
+        count = min(max(num_views, VIEWS[0]), VIEWS[-1])
+        upper = min(bisect_right(VIEWS, count), len(VIEWS) - 1)
+        few, many = VIEWS[upper - 1], VIEWS[upper]
+        # Increasing whatever the share is: the mean of two increasing sequences.
+        share = math.log(count / few) / math.log(many / few)
+        of_few, of_many = Curve(*self._row(upper - 1)), Curve(*self._row(upper))
+        return Curve(*(torch.lerp(*pair, share) for pair in zip(of_few, of_many, strict=True)))
+
+    def set(self, num_views: int, curve: Curve) -> None:
         """Take over a fitted curve.
 
+        Args:
+            num_views: one of ``VIEWS``.
+            curve: for it.
+
         Raises:
-            ValueError: there are not 8 of each, or they don't increase: the order of pixels by
-                certainty would be lost.
+            ValueError: there is no curve for this number; or there are not 8 knots and values, or
+                they don't increase: the order of pixels by certainty would be lost.
         """
-        for name, points in (("knots", knots), ("values", values)):
+        if num_views not in VIEWS:
+            raise ValueError(f"num_views must be one of {VIEWS}, got {num_views}")
+        for name, points in curve._asdict().items():
             if points.shape != (NUM_KNOTS,) or not bool((points.diff() > 0).all()):
                 raise ValueError(f"{name} must be {NUM_KNOTS} increasing numbers, got {points}")
-        self.knots.copy_(knots)
-        self.values.copy_(values)
+        knots, values = self._row(VIEWS.index(num_views))
+        knots.copy_(curve.knots)
+        values.copy_(curve.values)
 
     def reset(self) -> None:
         """Back to the identity: the spread as the network predicts it."""
-        identity = torch.linspace(*RANGE, NUM_KNOTS)
-        self.set(identity, identity)
+        self.knots.copy_(_identity())
+        self.values.copy_(_identity())
+
+    def _row(self, index: int) -> tuple[Tensor, Tensor]:
+        return self.knots[index], self.values[index]
 
 
-def _identity_if_missing(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Give a state of before there were calibrations the identity."""
+def _identity() -> Tensor:
+    return torch.linspace(*RANGE, NUM_KNOTS).repeat(len(VIEWS), 1)
+
+
+def _of_older_weights(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Give a state of before there were calibrations the identity, and repeat a lone curve."""
     names = [prefix + "knots", prefix + "values"]
     if not any(name in state for name in names):
-        for name in names:
-            state[name] = torch.linspace(*RANGE, NUM_KNOTS)
+        state.update(dict.fromkeys(names, _identity()))
+    for name in names:
+        if name in state and state[name].shape == (NUM_KNOTS,):
+            state[name] = state[name].repeat(len(VIEWS), 1)

@@ -215,7 +215,7 @@ class Deltas(nn.Module):
         log_std = upsample_to(dense.log_spread, image_size) + 0.5 * math.log(2)
         return DepthPrediction(
             depth=full,
-            std=self.calibration(log_std).exp() * full,
+            std=self.calibration(log_std, views.K.shape[1]).exp() * full,
             keypoints=keypoints,
             matches=matches,
             points=points,

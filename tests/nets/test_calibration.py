@@ -17,18 +17,18 @@ from deltas_nets.config import DetectorConfig, NetworkConfig
 from deltas_nets.data.capture import open_capture
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
-from deltas_nets.data.view_sets import choose_view_sets
+from deltas_nets.data.view_choice import choose_view_sets
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.capture import evaluate_network
-from deltas_nets.evaluate.fit_calibration import Curve, fit_calibration, fit_curve
+from deltas_nets.evaluate.fit_calibration import fit_calibration, fit_curve
 from deltas_nets.evaluate.rooms import (
     CALIBRATION_SEEDS,
     EVALUATION_SEEDS,
     DisturbedRooms,
     held_out_rooms,
 )
-from deltas_nets.network.calibration import NUM_KNOTS, SpreadCalibration
+from deltas_nets.network.calibration import NUM_KNOTS, VIEWS, Curve, SpreadCalibration
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.predict import PredictConfig, frames_of, predict_frame
 from deltas_nets.pretrained import load_weights, read_metadata, save_weights
@@ -168,9 +168,7 @@ def test_what_has_no_truth_or_no_prediction_counts_nowhere() -> None:
 
 def corrected(curve: Curve, std: Array) -> Array:
     """What a calibrated network would predict."""
-    calibration = SpreadCalibration()
-    calibration.set(*curve)
-    changed: Array = calibration(torch.tensor(std).log()).exp().double().numpy()
+    changed: Array = curve(torch.tensor(std).log()).exp().double().numpy()
     return changed
 
 
@@ -245,12 +243,12 @@ def test_neighbours_that_violate_the_order_are_averaged() -> None:
 
 def test_the_identity_changes_nothing_and_a_curve_only_the_deviation() -> None:
     values = torch.linspace(-9, 5, 50, dtype=torch.float64)
-    assert torch.allclose(SpreadCalibration()(values), values, atol=1e-5)
+    assert torch.allclose(SpreadCalibration()(values, 3), values, atol=1e-5)
     model, room = tiny(), Rooms(1, num_views=2, image_size=(48, 64))[0]
     images = room.images.float() / 255
     with torch.no_grad():
         before = model(images, room.views)
-        model.calibration.set(torch.arange(-6.0, 2.0), 2 * torch.arange(-6.0, 2.0) + 1)
+        model.calibration.set(2, Curve(torch.arange(-6.0, 2.0), 2 * torch.arange(-6.0, 2.0) + 1))
         after = model(images, room.views)
     assert torch.equal(before.depth, after.depth)
     log_std = (before.std / before.depth).log()
@@ -262,23 +260,51 @@ def test_the_identity_changes_nothing_and_a_curve_only_the_deviation() -> None:
 def test_a_curve_agrees_with_numpys_interpolation() -> None:
     random = np.random.default_rng(9)
     knots, values = (np.sort(random.normal(size=NUM_KNOTS)) for _ in range(2))
-    calibration = SpreadCalibration()
-    calibration.set(torch.tensor(knots), torch.tensor(values))
+    curve = Curve(torch.tensor(knots), torch.tensor(values))
     x = torch.linspace(-4, 4, 101)
     beyond = np.minimum(x.numpy() - knots[0], 0) + np.maximum(x.numpy() - knots[-1], 0)
-    assert calibration(x).numpy() == pytest.approx(np.interp(x, knots, values) + beyond, abs=1e-5)
+    assert curve(x).numpy() == pytest.approx(np.interp(x, knots, values) + beyond, abs=1e-5)
 
 
 def test_curves_that_lose_the_order_are_refused() -> None:
     rising = torch.arange(float(NUM_KNOTS))
     for knots, values in ((rising, rising.flip(0)), (rising * 0, rising), (rising[:3], rising)):
         with pytest.raises(ValueError, match="increasing"):
-            SpreadCalibration().set(knots, values)
+            SpreadCalibration().set(3, Curve(knots, values))
+
+
+def test_between_two_numbers_of_views_lies_the_mean_of_their_curves() -> None:
+    calibration, knots = SpreadCalibration(), torch.linspace(-5, 1, NUM_KNOTS)
+    for views in VIEWS:
+        calibration.set(views, Curve(knots + views / 10, knots + float(np.log(views))))
+    x = torch.linspace(-8, 3, 40)
+    for views in (2, 3, 5, 8):
+        assert torch.equal(calibration(x, views), calibration.curve(views)(x))
+        expected = Curve(knots + views / 10, knots + float(np.log(views)))(x)
+        assert torch.allclose(calibration(x, views), expected, atol=1e-5)
+    # Their values rise by the log of the number, so those between do as well.
+    for views in (4, 6, 7):
+        assert torch.allclose(calibration.curve(views).values, knots + float(np.log(views)))
+        assert (calibration(x, views).diff() > 0).all()
+    assert torch.equal(calibration(x, 1), calibration(x, 2))
+    assert torch.equal(calibration(x, 30), calibration(x, 8))
+    with pytest.raises(ValueError, match="one of"):
+        calibration.set(4, Curve(knots, knots))
+
+
+def test_a_lone_curve_of_older_weights_is_that_of_any_number_of_views() -> None:
+    model, state = tiny(1), tiny().state_dict()
+    knots = torch.linspace(-5, 1, NUM_KNOTS)
+    state["densifier.calibration.knots"] = knots
+    state["densifier.calibration.values"] = 2 * knots
+    model.load_state_dict(state)
+    for views in (2, 4, 7):
+        assert torch.allclose(model.calibration.curve(views).values, 2 * knots)
 
 
 def test_a_calibration_survives_a_file(tmp_path: Path) -> None:
     model = tiny()
-    model.calibration.set(torch.arange(-6.0, 2.0), 0.5 * torch.arange(-6.0, 2.0) - 1)
+    model.calibration.set(5, Curve(torch.arange(-6.0, 2.0), 0.5 * torch.arange(-6.0, 2.0) - 1))
     save_weights(tmp_path / "w.safetensors", model, {})
     loaded = load_model(tmp_path / "w.safetensors").calibration
     assert torch.equal(loaded.knots, model.calibration.knots)
@@ -288,7 +314,7 @@ def test_a_calibration_survives_a_file(tmp_path: Path) -> None:
 def test_weights_without_a_calibration_load_as_the_identity(tmp_path: Path) -> None:
     old = {name: t for name, t in tiny().state_dict().items() if "calibration" not in name}
     model = tiny(1)
-    model.calibration.set(torch.arange(-6.0, 2.0), torch.arange(-6.0, 2.0) + 3)
+    model.calibration.set(3, Curve(torch.arange(-6.0, 2.0), torch.arange(-6.0, 2.0) + 3))
     model.load_state_dict(dict(old))
     assert torch.equal(model.calibration.values, SpreadCalibration().values)
     assert "densifier.calibration.knots" not in old
@@ -303,8 +329,10 @@ def test_weights_without_a_calibration_load_as_the_identity(tmp_path: Path) -> N
 
 def test_fitting_on_rooms_replaces_what_was_fitted_before() -> None:
     model = tiny()
-    rooms = Rooms(2, seed=CALIBRATION_SEEDS.start, num_views=2, image_size=(48, 64))
-    kept: list[PosedImages] = [rooms[0], rooms[1]]
+    kept: dict[int, list[PosedImages]] = {}
+    for views in VIEWS:
+        rooms = Rooms(2, seed=CALIBRATION_SEEDS.start, num_views=views, image_size=(48, 64))
+        kept[views] = [rooms[0], rooms[1]]
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     counted: list[str] = []
     first = fit_calibration(model, kept, report=counted.append)
@@ -312,7 +340,7 @@ def test_fitting_on_rooms_replaces_what_was_fitted_before() -> None:
     assert not torch.equal(values, before["densifier.calibration.values"])
     second = fit_calibration(model, kept)
     assert first == second and torch.equal(values, model.calibration.values)
-    assert len(counted) == 2
+    assert len(counted) == 2 * len(VIEWS) and len({tuple(row) for row in values.tolist()}) == 4
     changed = [n for n, t in model.state_dict().items() if not torch.equal(t, before[n])]
     assert changed == ["densifier.calibration.knots", "densifier.calibration.values"]
 
@@ -359,7 +387,7 @@ def test_calibrate_writes_weights_that_say_so(run: Run, weights: Path, tmp_path:
     assert "before" in result.out and "after" in result.out and "most certain half" in result.out
     metadata = read_metadata(out)
     assert metadata["step"] == "5" and metadata["licence"] == "Apache-2.0"
-    assert metadata["calibration"] == "procedural rooms 500..502, 2 views, 48x64"
+    assert metadata["calibration"] == "procedural rooms 500..502, 2, 3, 5, 8 views, 48x64"
     assert not torch.equal(load_model(out).calibration.values, SpreadCalibration().values)
     assert_one_line(run(*command), "the file exists", "--overwrite")
     assert run(*command, "--overwrite").code == 0
