@@ -27,7 +27,7 @@ from deltas_nets.cost.report import gmacs
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
 from deltas_nets.pretrained import load_model
-from deltas_nets.train.batches import training_data
+from deltas_nets.train.data_sets import training_data
 from deltas_nets.train.fit import fit
 from deltas_nets.train.start import Start
 from deltas_nets.train.step import DEPTH_RANGE

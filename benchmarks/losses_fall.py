@@ -14,7 +14,8 @@ from torch import Tensor
 from deltas_nets.config import TRAIN_CONFIGS, DataConfig, TrainConfig
 from deltas_nets.losses import Losses
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.train.batches import BatchMaker, room_loader
+from deltas_nets.train.batches import BatchMaker
+from deltas_nets.train.loader import room_loader
 from deltas_nets.train.optimiser import make_optimizer, set_learning_rate
 from deltas_nets.train.step import Objective
 

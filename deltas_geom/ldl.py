@@ -102,37 +102,15 @@ class Pivots(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """LDL^T, unit lower triangular L.
+    """LDL^T, to solve with.
 
     Attributes:
-        i0: inverse pivot 0, and so on.
-        i1: ...
-        i2: ...
-        d3: the last pivot, which may vanish.
-        s0: the last pivot by pivot 0, and so on.
-        s1: ...
-        s2: ...
-        l10: row 1, column 0 of L, and so on.
-        l20: ...
-        l30: ...
-        l21: ...
-        l31: ...
-        l32: ...
+        pivots: LDL^T.
+        scales: the last pivot by each of the others.
     """
 
-    i0: Tensor
-    i1: Tensor
-    i2: Tensor
-    d3: Tensor
-    s0: Tensor
-    s1: Tensor
-    s2: Tensor
-    l10: Tensor
-    l20: Tensor
-    l30: Tensor
-    l21: Tensor
-    l31: Tensor
-    l32: Tensor
+    pivots: Pivots
+    scales: Vector3
 
 
 def eliminate(matrix: Symmetric4) -> Pivots:
@@ -152,8 +130,12 @@ def eliminate(matrix: Symmetric4) -> Pivots:
 
 def factor(matrix: Symmetric4) -> Factors:
     """The same, to solve with."""
-    i0, i1, i2, d3, *lower = eliminate(matrix)
-    return Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, *lower)
+    return _to_solve_with(eliminate(matrix))
+
+
+def _to_solve_with(pivots: Pivots) -> Factors:
+    d3 = pivots.d3
+    return Factors(pivots, (pivots.i0 * d3, pivots.i1 * d3, pivots.i2 * d3))
 
 
 def factor_columns(columns: Vector4) -> Factors:
@@ -176,7 +158,7 @@ def factor_columns(columns: Vector4) -> Factors:
     l32 = _over_rows(a2, a3) * i2
     a3 = _less_column(a3, l32, a2)
     d3 = _over_rows(a3, a3)
-    return Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, l10, l20, l30, l21, l31, l32)
+    return _to_solve_with(Pivots(i0, i1, i2, d3, l10, l20, l30, l21, l31, l32))
 
 
 def _over_rows(a: Tensor, b: Tensor) -> Tensor:
@@ -187,7 +169,7 @@ def _less_column(a: Tensor, share: Tensor, b: Tensor) -> Tensor:
     return less(a, share.unsqueeze(-2), b)
 
 
-def shifted_factors(f: Factors, shift: Tensor) -> Factors:
+def shifted_factors(f: Pivots, shift: Tensor) -> Factors:
     """LDL^T of M - shift from that of M, whose digits it keeps.
 
     Column by column the difference C of the remainders, at first -shift, is carried along.
@@ -207,7 +189,7 @@ def shifted_factors(f: Factors, shift: Tensor) -> Factors:
     w3 = less(c23, f.l32, c22)
     l32 = torch.addcmul(f.l32, w3, i2)
     d3 = f.d3 + less(less(c33, f.l32, c23), w3, l32)
-    return Factors(i0, i1, i2, d3, i0 * d3, i1 * d3, i2 * d3, l10, l20, l30, l21, l31, l32)
+    return _to_solve_with(Pivots(i0, i1, i2, d3, l10, l20, l30, l21, l31, l32))
 
 
 def solve_leading(f: Pivots, b: Vector3) -> Vector3:
@@ -219,24 +201,26 @@ def solve_leading(f: Pivots, b: Vector3) -> Vector3:
     return less(less(b0 * f.i0, f.l10, x1), f.l20, x2), x1, x2
 
 
-def solve_scaled(f: Factors, b: Vector4) -> Vector4:
+def solve_scaled(factors: Factors, b: Vector4) -> Vector4:
     """The last pivot times M^-1 b: the pivot that vanishes is never divided by."""
+    f, (s0, s1, s2) = factors
     b0, b1, b2, b3 = b
     b1 = less(b1, f.l10, b0)
     b2 = less(less(b2, f.l20, b0), f.l21, b1)
     b3 = less(less(less(b3, f.l30, b0), f.l31, b1), f.l32, b2)
-    return _back(f, b0 * f.s0, b1 * f.s1, b2 * f.s2, b3)
+    return _back(f, b0 * s0, b1 * s1, b2 * s2, b3)
 
 
-def start(f: Factors) -> Vector4:
+def start(factors: Factors) -> Vector4:
     """The same for a b of which L^-1 b is constant: nearly M^-1 e4, the inhomogeneous solution.
 
     The other components reach vectors near infinity, to which e4 is nearly orthogonal.
     """
-    return _back(f, 0.13 * f.s0, 0.07 * f.s1, 0.11 * f.s2, torch.ones_like(f.d3))
+    f, (s0, s1, s2) = factors
+    return _back(f, 0.13 * s0, 0.07 * s1, 0.11 * s2, torch.ones_like(f.d3))
 
 
-def _back(f: Factors, z0: Tensor, z1: Tensor, z2: Tensor, z3: Tensor) -> Vector4:
+def _back(f: Pivots, z0: Tensor, z1: Tensor, z2: Tensor, z3: Tensor) -> Vector4:
     z2 = less(z2, f.l32, z3)
     z1 = less(less(z1, f.l21, z2), f.l31, z3)
     z0 = less(less(less(z0, f.l10, z1), f.l20, z2), f.l30, z3)

@@ -118,13 +118,13 @@ def _iterated(
     noise = rounding(matrix)
     factors, x, near = _inverse_iterations(matrix, noise)
     length = dot(near, near)
-    quotient = factors.d3 * dot(near, x) / length - noise
+    quotient = factors.pivots.d3 * dot(near, x) / length - noise
     near, quotient = _nearer(matrix, scaled(near, length.rsqrt()), quotient, noise)
 
     # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
     factors = factor(shifted(matrix, quotient + noise))
-    signs = factors.i0.sign() + factors.i1.sign() + factors.i2.sign() + factors.d3.sign()
-    simple = signs == 2
+    p = factors.pivots
+    simple = p.i0.sign() + p.i1.sign() + p.i2.sign() + p.d3.sign() == 2
     vector = solve_scaled(factors, near)
     if product is not None:
         for _ in range(polish):
@@ -167,7 +167,7 @@ def _smaller(
     along, length = dot(a, b), dot(b, b)
     across = torch.addcmul(length, along, along, value=-1)
     # K in the plane, times across: below * across, g * sqrt(across), -along * g.
-    g = less(factors.d3, below, along)
+    g = less(factors.pivots.d3, below, along)
     half = 0.5 * torch.addcmul(below * across, along, g)
     step = half + torch.addcmul(half * half, g * g, across).clamp(min=0).sqrt()
     # Where both are one, or both quotients, within rounding, the iteration has converged.
@@ -176,17 +176,17 @@ def _smaller(
     of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
     of_b = torch.where(flat, one, -step)
     x0, x1, x2, x3 = (torch.addcmul(of_a * p, of_b, q) for p, q in zip(a, b, strict=True))
-    change = torch.where(flat, below - factors.d3 * along / length, step / across)
+    change = torch.where(flat, below - factors.pivots.d3 * along / length, step / across)
     return (x0, x1, x2, x3), quotient - change
 
 
-def _polished(f: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
+def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
     """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
     image = product(x)
     mu = dot(x, image)
     g0, g1, g2, g3 = (less(image[i], mu, x[i]) for i in range(4))
-    inverse = f.d3.reciprocal()
-    change = solve_scaled(f, (g0, g1, g2, g3))
+    inverse = factors.pivots.d3.reciprocal()
+    change = solve_scaled(factors, (g0, g1, g2, g3))
     # What the solve amplifies is along x, and goes.
     along = dot(x, change)
     x0, x1, x2, x3 = (less(x[i], inverse, less(change[i], along, x[i])) for i in range(4))
@@ -201,14 +201,14 @@ def _by_columns(columns: Vector4, x: Vector4) -> Vector4:
     x = unit(x)
     near = solve_scaled(factors, x)
     length = dot(near, near)
-    quotient = factors.d3 * dot(near, x) / length
-    nearest = shifted_factors(factors, quotient)
+    quotient = factors.pivots.d3 * dot(near, x) / length
+    nearest = shifted_factors(factors.pivots, quotient)
     zero = torch.zeros_like(quotient)
     # Vectors closer than 1e-4 span their plane badly, and need it no more.
     near, quotient = _smaller(
         nearest, scaled(near, length.rsqrt()), quotient, below=zero, noise=zero, same=1e-8
     )
-    return solve_scaled(shifted_factors(factors, quotient), unit(near))
+    return solve_scaled(shifted_factors(factors.pivots, quotient), unit(near))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:

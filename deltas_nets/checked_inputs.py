@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 
 from deltas_nets.data.capture import Capture, ids_in_words
-from deltas_nets.data.view_sets import ViewSet, check_frames, choose_view_sets, read_view_sets
+from deltas_nets.data.view_choice import choose_view_sets
+from deltas_nets.data.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 

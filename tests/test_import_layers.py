@@ -36,6 +36,7 @@ ORDER = [
     "triangulation",
     "refine",
     "rays",
+    "track_equations",
     "tracks",
     "midpoint",
     "two_view",

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from deltas_nets.data.capture import FloatArray
 from deltas_nets.data.scannet_scenes import Scene
-from deltas_nets.data.view_sets import spread_sources
+from deltas_nets.data.view_choice import spread_sources
 
 __all__ = ["ByBaseline", "ByGap", "TupleRule"]
 

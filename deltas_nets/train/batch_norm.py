@@ -5,10 +5,11 @@ from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from deltas_nets.config import TrainConfig
+from deltas_nets.train.freeze import frozen_stages
 
 
 def prepare_batch_norm(model: nn.Module, config: TrainConfig, *, processes: int) -> None:
-    """Freeze the statistics, or share them between GPUs, as the config says.
+    """Freeze statistics, all or those of frozen stages, or share them between GPUs.
 
     Parameters and buffers stay the same objects, so an optimizer made before keeps working.
 
@@ -18,11 +19,13 @@ def prepare_batch_norm(model: nn.Module, config: TrainConfig, *, processes: int)
         processes: of the run. PyTorch shares statistics between GPUs only; on CPUs each process
             normalises by its own rooms, and the running statistics are those of the first.
     """
+    as_they_are = [model] if config.freeze_batch_norm else frozen_stages(model, config)
+    for module in (module for part in as_they_are for module in part.modules()):
+        if isinstance(module, _BatchNorm):
+            module.eval()
     if config.freeze_batch_norm:
-        for module in model.modules():
-            if isinstance(module, _BatchNorm):
-                module.eval()
-    elif config.sync_batchnorm and processes > 1 and next(model.parameters()).is_cuda:
+        return
+    if config.sync_batchnorm and processes > 1 and next(model.parameters()).is_cuda:
         nn.SyncBatchNorm.convert_sync_batchnorm(model)  # type: ignore[no-untyped-call]
 
 

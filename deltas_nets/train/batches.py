@@ -1,20 +1,15 @@
-"""What each training step sees: on one kind of device, a function of config and step alone.
+"""A step's rooms as the network sees them: on one kind of device, a function of config and step.
 
-So a resumed run continues exactly, a step can be looked at without running those before, and
-several processes see together what one would: each takes its part of every step's rooms, and
-what is drawn for a room depends on its place in the step, not on who holds it. A tuple of
-ScanNet's frames counts as a room; reading it draws nothing. Rooms come as they are on disk, are
-moved to the device that trains, and everything else happens there, to all of them at once.
+What is drawn for a room depends on its place in the step, not on who holds it, so a step can be
+looked at without running those before. Everything happens on the device that the rooms are on, to
+all of them at once.
 """
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler, Subset, default_collate
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TrainConfig
@@ -28,26 +23,7 @@ from deltas_nets.data.augment import (
     resize,
 )
 from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.scannet_tuples import ScanNetTuples, open_scannet
-from deltas_nets.data.synthetic import Rooms
-from deltas_nets.errors import UserError
-from deltas_nets.train.shelves import Shelves, places_with_new_rooms
-from deltas_nets.train.stop import leave_to_the_trainer
-
-
-class Part(NamedTuple):
-    """Which of equal, consecutive parts of a step's rooms."""
-
-    number: int = 0
-    parts: int = 1
-
-    def of(self, batch_size: int) -> range:
-        """The places in a step whose rooms belong to this part."""
-        size = batch_size // self.parts
-        return range(self.number * size, (self.number + 1) * size)
-
-
-ALL = Part()
+from deltas_nets.train.loader import ALL, Part
 
 
 class Batch(NamedTuple):
@@ -86,185 +62,6 @@ class Batch(NamedTuple):
             self.anchors[rooms],
             None if self.labels is None else self.labels[rooms],
         )
-
-
-class StepSampler(Sampler[list[int]]):
-    """New rooms of the steps ``start .. stop``: every epoch a new order, the same for a seed.
-
-    Args:
-        num_rooms: in an epoch.
-        batch_size: places in a step.
-        seed: of the orders.
-        start: first step. With ``replay`` > 1 it may be negative: what comes before step 0 gives
-            every place its first room.
-        stop: the step after the last.
-        part: whose places.
-        replay: a place gets a new room in every so many steps; its places take turns.
-    """
-
-    def __init__(
-        self,
-        num_rooms: int,
-        batch_size: int,
-        *,
-        seed: int,
-        start: int,
-        stop: int,
-        part: Part = ALL,
-        replay: int = 1,
-    ) -> None:
-        self.num_rooms = num_rooms
-        self.batch_size = batch_size
-        self.seed = seed
-        self.steps = range(start, stop)
-        self.part = part
-        self.replay = replay
-
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def __iter__(self) -> Iterator[list[int]]:
-        epoch, order = -1, torch.empty(0, dtype=torch.long)
-        per_step = self.batch_size // self.replay
-        for step in self.steps:
-            batch = []
-            for place in places_with_new_rooms(step, self.part.of(self.batch_size), self.replay):
-                number = (step + self.replay - 1) * per_step + place // self.replay
-                if number // self.num_rooms != epoch:
-                    epoch = number // self.num_rooms
-                    shuffle = torch.Generator().manual_seed(self.seed * 1_000_003 + epoch)
-                    order = torch.randperm(self.num_rooms, generator=shuffle)
-                batch.append(int(order[number % self.num_rooms]))
-            yield batch
-
-
-def training_data(
-    config: TrainConfig, *, report: Callable[[str], None] = lambda _: None
-) -> Rooms | ScanNetTuples:
-    """What the config wants to train on.
-
-    Args:
-        config: of the run.
-        report: gets lines about what there is.
-
-    Raises:
-        UserError: there is none of it.
-    """
-    data = config.data
-    if data.source == "scannet":
-        return _frames(config, data.scannet.split, "--data.split", report)
-    return Rooms(
-        data.num_rooms,
-        seed=data.seed,
-        num_views=data.num_views,
-        image_size=(data.height, data.width),
-        cache_dir=None if data.cache is None else Path(data.cache),
-    )
-
-
-def validation_data(
-    config: TrainConfig, *, report: Callable[[str], None] = lambda _: None
-) -> Subset[PosedImages] | None:
-    """Tuples of the validation split, spread evenly over it; None if the config names none.
-
-    Raises:
-        UserError: there is none.
-    """
-    scannet = config.data.scannet
-    if scannet.validation is None:
-        return None
-    frames = _frames(config, scannet.validation, "--data.validation", report)
-    count = min(scannet.validation_tuples, len(frames))
-    return Subset(frames, [len(frames) * number // count for number in range(count)])
-
-
-def _frames(
-    config: TrainConfig, split: str, option: str, report: Callable[[str], None]
-) -> ScanNetTuples:
-    data = config.data
-    return open_scannet(
-        data.scannet,
-        split,
-        num_views=config.max_views,
-        image_size=(data.height, data.width),
-        cache=None if data.cache is None else Path(data.cache),
-        option=option,
-        report=report,
-    )
-
-
-def step_loader(
-    data: Rooms | ScanNetTuples,
-    config: TrainConfig,
-    *,
-    start: int,
-    stop: int,
-    part: Part = ALL,
-    device: torch.device | str = "cpu",
-) -> Iterator[PosedImages]:
-    """Rooms of the steps ``start .. stop`` on a device, read or rendered ahead by workers.
-
-    Raises:
-        UserError: one of them cannot be read.
-    """
-    if start >= stop:  # nothing to fill shelves for
-        return
-    places, replay = part.of(config.batch_size), config.data.replay
-    shelves = Shelves(places, config.data.shelf, replay, seed=config.seed)
-    first = shelves.first_step(start)
-    sampler = StepSampler(
-        len(data),
-        config.batch_size,
-        seed=config.seed,
-        start=first,
-        stop=stop,
-        part=part,
-        replay=replay,
-    )
-    loader: DataLoader[PosedImages | UserError | None] = DataLoader(
-        _OrError(data),
-        batch_sampler=sampler,
-        num_workers=config.data.workers,
-        collate_fn=_collate,
-        worker_init_fn=leave_to_the_trainer,
-    )
-    for step, rooms in enumerate(loader, first):
-        if isinstance(rooms, UserError):
-            raise rooms
-        if rooms is not None:
-            shelves.put(rooms.map(lambda tensor: tensor.to(device)), step)
-        if step >= start:
-            yield shelves.take(step)
-
-
-def room_loader(
-    config: TrainConfig, *, start: int, stop: int, part: Part = ALL
-) -> Iterator[PosedImages]:
-    """:func:`step_loader` of the config's own data."""
-    return step_loader(training_data(config), config, start=start, stop=stop, part=part)
-
-
-class _OrError(Dataset[PosedImages | UserError]):
-    """Errors as items: of one that a worker raises nothing but its traceback comes through."""
-
-    def __init__(self, data: Rooms | ScanNetTuples) -> None:
-        self.data = data
-
-    def __getitem__(self, index: int) -> PosedImages | UserError:
-        try:
-            return self.data[index]
-        except UserError as error:
-            return error
-
-
-def _collate(items: list[PosedImages | UserError]) -> PosedImages | UserError | None:
-    for item in items:
-        if isinstance(item, UserError):
-            return item
-    if not items:  # a step in which this process's places get no new room
-        return None
-    batch: PosedImages = default_collate(items)
-    return batch
 
 
 class BatchMaker:

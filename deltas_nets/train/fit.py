@@ -13,8 +13,10 @@ from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.rooms import evaluate_rooms
-from deltas_nets.train.batches import BatchMaker, step_loader, training_data, validation_data
+from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.checkpoint import WEIGHTS, remove_half_written, save_run
+from deltas_nets.train.data_sets import training_data, validation_data
+from deltas_nets.train.loader import step_loader
 from deltas_nets.train.log import FolderLog, RunLog
 from deltas_nets.train.optimiser import set_learning_rate
 from deltas_nets.train.processes import launch_fabric, part_of

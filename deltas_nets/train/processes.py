@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
-from deltas_nets.train.batches import Part
+from deltas_nets.train.loader import Part
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

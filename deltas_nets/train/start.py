@@ -17,6 +17,7 @@ from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batch_norm import prepare_batch_norm
 from deltas_nets.train.checkpoint import RunState, load_run
+from deltas_nets.train.freeze import frozen_stages
 from deltas_nets.train.optimiser import make_optimizer
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.step import unreached
@@ -96,6 +97,8 @@ def starting_state(
         if new:
             report(f"{start.init} lacks {len(new)} weights of this network: they start anew")
         model.calibration.reset()  # it was fitted to what is about to change
+    for stage in frozen_stages(model, config):
+        stage.requires_grad_(False)
     if fabric.world_size > 1:
         parameters = dict(model.named_parameters())
         for name in unreached(model, config):

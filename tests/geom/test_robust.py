@@ -359,7 +359,7 @@ def test_no_input_gives_nan_or_inf(
 ) -> None:
     pixels[0, 0], weights[1, 1] = torch.nan, torch.inf
     for dtype in (torch.float32, torch.float64):
-        # As in test_triangulation: true gradients of 1e40 do not fit float32.
+        # As in test_triangulation_status: true gradients of 1e40 do not fit float32.
         power = 0.25 if dtype == torch.float32 else 1
         cameras = (proj.sign() * proj.abs() ** power if wild else ring().views.proj).to(dtype)
         inputs = [

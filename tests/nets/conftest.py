@@ -1,13 +1,19 @@
-"""Small captures on disk."""
+"""Small captures and scenes on disk, and the `deltas` command."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+from run_command import Run, runner
 
+from deltas_geom import PosedViews
+from deltas_nets.atomic_files import write_depth_png
 from deltas_nets.data.capture import Capture, open_capture
+from deltas_nets.data.posed_images import PosedImages
+from deltas_nets.data.synthetic import render_room
 
 MakeCapture = Callable[..., Path]
 
@@ -62,3 +68,48 @@ def make_capture(tmp_path: Path) -> MakeCapture:
 def capture(make_capture: MakeCapture) -> Capture:
     """Four frames in a row."""
     return open_capture(make_capture())
+
+
+def write_scene(folder: Path, room: PosedImages) -> None:
+    """A rendered room as ScanNet would have exported it."""
+    for name in ("color", "depth", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", room.views.K[0].numpy(), fmt="%.6f")
+    world_from_cam = torch.linalg.inv(room.views.cam_from_world.double())
+    for id in range(len(room.images)):
+        pixels = room.images[id].permute(1, 2, 0).numpy()
+        Image.fromarray(pixels).save(folder / "color" / f"{id}.png")
+        write_depth_png(folder / "depth" / f"{id}.png", room.depth[id].numpy())
+        np.savetxt(folder / "pose" / f"{id}.txt", world_from_cam[id].numpy(), fmt="%.9f")
+
+
+@pytest.fixture(scope="session")
+def scannet_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three scenes of 9 frames, two to train on and one to test on; never written to."""
+    root = tmp_path_factory.mktemp("scannet")
+    room = render_room(0, num_views=9, image_size=(96, 128))
+    # One room, its frames in another order each time: rendering takes longer than the tests.
+    for turn, name in enumerate(
+        ("scans/scene0000_00", "scans/scene0706_01", "scans_test/scene0707_00")
+    ):
+        order = torch.arange(9).roll(4 * turn)
+        views = PosedViews(*(tensor[order] for tensor in room.views))
+        write_scene(root / name, PosedImages(room.images[order], views, room.depth[order]))
+    return root
+
+
+@pytest.fixture
+def scannet_copy(scannet_root: Path, tmp_path: Path) -> Path:
+    """A copy to break; files that are not touched stay links."""
+    copy = tmp_path / "scannet"
+    for file in scannet_root.rglob("*.*"):
+        target = copy / file.relative_to(scannet_root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(file)
+    return copy
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+    """Run `deltas` with arguments, in this process."""
+    return runner(monkeypatch, capfd)

@@ -31,8 +31,9 @@ from deltas_nets.losses import masked_mean
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batch_norm import Statistics, prepare_batch_norm
-from deltas_nets.train.batches import BatchMaker, room_loader
+from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.fit import Start, fit
+from deltas_nets.train.loader import room_loader
 from deltas_nets.train.processes import check_batch_size
 from deltas_nets.train.step import Objective, unreached
 

@@ -12,7 +12,7 @@ from deltas_geom import PosedViews
 from deltas_nets.config import DataConfig, TrainConfig
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
-from deltas_nets.train.batches import Part, StepSampler, step_loader
+from deltas_nets.train.loader import Part, StepSampler, step_loader
 from deltas_nets.train.shelves import Shelves, places_with_new_rooms
 
 # Fresh rooms per step, steps between a place's new rooms, rooms on a shelf.

@@ -26,8 +26,9 @@ from deltas_nets.teachers.superpoint import SuperPoint, load_superpoint
 from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train import start as start_module
 from deltas_nets.train import step as step_module
-from deltas_nets.train.batches import Batch, BatchMaker, room_loader
+from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start
+from deltas_nets.train.loader import room_loader
 from deltas_nets.train.step import Objective
 
 TAUGHT = replace(CONFIG, steps=2, teacher="superpoint")

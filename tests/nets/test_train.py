@@ -26,8 +26,9 @@ from deltas_nets.data.synthetic import Rooms, render_room
 from deltas_nets.errors import UserError
 from deltas_nets.targets import read_nearest
 from deltas_nets.train import fit as fit_module
-from deltas_nets.train.batches import Batch, BatchMaker, Part, StepSampler, room_loader
+from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit
+from deltas_nets.train.loader import Part, StepSampler, room_loader
 from deltas_nets.train.log import drop_later_entries
 from deltas_nets.train.optimiser import learning_rate_factor
 from deltas_nets.train.step import Stepper, StepResult

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from deltas_nets.data.capture import Capture, Frame, open_capture
-from deltas_nets.data.view_sets import ViewSet, check_frames, choose_view_sets, read_view_sets
+from deltas_nets.data.view_choice import choose_view_sets
+from deltas_nets.data.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]
