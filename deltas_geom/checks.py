@@ -1,4 +1,4 @@
-"""Shape checks: the words of every shape error in the package."""
+"""What arguments must be, in the words of every error."""
 
 import torch
 from torch import Tensor
@@ -12,10 +12,10 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     """Raise :class:`ShapeError` unless every tensor ends in its documented dims.
 
     A dim is a number, which must match, or a letter, which must have one size in all
-    tensors of the call. Leading batch dims are free.
+    tensors of the call; after "+" it must not be 0. Leading batch dims are free.
 
     Args:
-        **named: ``name=(tensor, "V 3 4")``.
+        **named: ``name=(tensor, "+V 3 4")``.
 
     Raises:
         ShapeError: a trailing shape differs, or two tensors disagree on a letter.
@@ -32,7 +32,7 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     for name, (tensor, spec) in named.items():
         if not isinstance(tensor, Tensor):
             raise TypeError(f"{name} must be a torch.Tensor, got {type(tensor).__name__}")
-        dims = spec.split()
+        dims = spec.replace("+", "").split()
         shape = tuple(tensor.shape)
         tail = shape[len(shape) - len(dims) :] if len(shape) >= len(dims) else None
         wrong = tail is None or any(
@@ -45,11 +45,27 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
             if dim.isdigit():
                 continue
             size_before, name_before = seen.setdefault(dim, (size, name))
+            if size == 0 and f"+{dim}" in spec:
+                raise ShapeError(f"{name} must have {dim} >= 1, got {shape}")
             if size != size_before:
                 raise ShapeError(
                     f"{name} has {dim} = {size} but {name_before} has {dim} = {size_before}; "
                     f"{name} must have shape (*B, {', '.join(dims)}), got {shape}"
                 )
+
+
+def check_bool(**named: Tensor | None) -> None:
+    """Raise ``TypeError`` unless every mask given is bool: numbers may mean weights, or indices."""
+    for name, mask in named.items():
+        if mask is not None and mask.dtype != torch.bool:
+            raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}")
+
+
+def check_index(**named: Tensor) -> None:
+    """Raise ``TypeError`` unless every tensor holds integers."""
+    for name, index in named.items():
+        if index.is_floating_point() or index.is_complex() or index.dtype == torch.bool:
+            raise TypeError(f"{name} must hold integers, got {index.dtype}")
 
 
 def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:

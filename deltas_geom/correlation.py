@@ -13,8 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.pixels import normalizing, resize_pixels
+from deltas_geom.precision import full_precision
 from deltas_geom.recompute import recomputed
 from deltas_geom.sampling import Samples
 
@@ -22,6 +23,7 @@ _CACHED_ELEMENTS = 1 << 20  # a chunk should stay in the cache between writing a
 _HELD_ELEMENTS = 1 << 28  # where there is no such cache: what one call may hold in memory
 
 
+@full_precision
 def correlate(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:
@@ -43,7 +45,7 @@ def correlate(
         broadcasts. At least float32.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError, TypeError: a trailing shape differs, a map is empty, the mask is not bool.
 
     Source: the paper, equation 1.
 
@@ -56,9 +58,10 @@ def correlate(
     """
     check_shapes(
         descriptors=(descriptors, "N D"),
-        feature_map=(feature_map, "S D h w"),
+        feature_map=(feature_map, "S D +h +w"),
         samples=(samples.pixels, "S N O M 2"),
     )
+    check_bool(mask=samples.mask)
     pixels, mask = samples.pixels, samples.mask
     batch = batch_shape(
         (*descriptors.shape[:-2], 1),
@@ -76,6 +79,7 @@ def correlate(
     )
 
 
+@full_precision
 def correlate_normalized(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:
@@ -102,12 +106,10 @@ def correlate_normalized(
         >>> row = torch.tensor([[1.0, 0.0], [0.0, 1.0]]).reshape(1, 2, 1, 2)  # two pixels, D = 2
         >>> between = torch.tensor([0.5, 0.0]).reshape(1, 1, 1, 1, 2)
         >>> samples = Samples(between, torch.ones(1, 1, 1), torch.tensor(True))
-        >>> correlate(torch.tensor([[1.0, 0.0]]), row, samples, image_size=(1, 2)).item()
+        >>> left = torch.tensor([[1.0, 0.0]])
+        >>> correlate(left, row, samples, image_size=(1, 2)).item()
         0.5
-        >>> cosine = correlate_normalized(
-        ...     torch.tensor([[1.0, 0.0]]), row, samples, image_size=(1, 2)
-        ... )
-        >>> round(cosine.item(), 4)
+        >>> round(correlate_normalized(left, row, samples, image_size=(1, 2)).item(), 4)
         0.7071
     """
     dots = correlate(descriptors, feature_map, samples, image_size=image_size)
@@ -174,10 +176,9 @@ class _DotProducts(torch.autograd.Function):
         mask: Tensor,
         image_size: tuple[int, int],
     ) -> Tensor:
-        with torch.autocast(features.device.type, enabled=False):
-            flat, rows, grid = _in_full(features, descriptors, pixels, image_size)
-            maps = (rows @ flat).reshape(-1, 1, *features.shape[-2:])
-            read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+        flat, rows, grid = _in_full(features, descriptors, pixels, image_size)
+        maps = (rows @ flat).reshape(-1, 1, *features.shape[-2:])
+        read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
         return _masked(read.reshape(mask.shape), mask)
 
     @staticmethod

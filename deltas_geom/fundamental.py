@@ -6,6 +6,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
+from deltas_geom.precision import full_precision, promoted
 from deltas_geom.views import PosedViews
 
 
@@ -30,6 +31,7 @@ def inverse_intrinsics(K: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(K.shape)
 
 
+@full_precision
 def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> Tensor:
     """Fundamental matrix F with x_source^T F x_anchor = 0 for pixels of one point.
 
@@ -44,14 +46,16 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
 
     Source: Hartley and Zisserman, 2nd ed., equation 9.2; the paper, section 3.2.
     """
+    K, cam_from_world = promoted(*views)
     source_from_anchor = relative_pose(
-        views.cam_from_world[..., source, :, :], views.cam_from_world[..., anchor, :, :]
+        cam_from_world[..., source, :, :], cam_from_world[..., anchor, :, :]
     )
     essential = cross_matrix(source_from_anchor[..., :3, 3]) @ source_from_anchor[..., :3, :3]
-    K_anchor, K_source = views.K[..., anchor, :, :], views.K[..., source, :, :]
+    K_anchor, K_source = K[..., anchor, :, :], K[..., source, :, :]
     return inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
 
 
+@full_precision
 def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     r"""Lines of the second view on which the first view's pixels must lie.
 
@@ -73,6 +77,7 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     Source: Hartley and Zisserman, 2nd ed., section 9.2.
     """
     check_shapes(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
+    fundamental, pixels = promoted(fundamental, pixels)
     lines = to_homogeneous(pixels) @ fundamental.mT
     size = lines[..., :2].detach().abs().amax(dim=-1, keepdim=True)
     scale = to_homogeneous(pixels).abs() @ fundamental[..., :2, :].abs().mT
@@ -85,6 +90,7 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     return lines * torch.where(has_line, squared, 1.0).rsqrt()
 
 
+@full_precision
 def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Signed distance of the second view's pixels from the first view's epipolar lines.
 

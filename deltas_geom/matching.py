@@ -10,8 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.homogeneous import safe_divide
+from deltas_geom.precision import full_precision
 from deltas_geom.sampling import Samples, sample_inv_depths
 from deltas_geom.views import PosedViews
 
@@ -54,20 +55,27 @@ class SoftArgmax(NamedTuple):
     entropy: Tensor
 
 
+@full_precision
 def soft_argmax(
     logits: Tensor, positions: Tensor, *, mask: Tensor | None = None, window: int | None = None
 ) -> SoftArgmax:
     """Mean position under the softmax of logits, optionally in a window around the peak.
 
     Args:
-        logits: ``(*B, S)``.
+        logits: ``(*B, S)``. What is not finite, such as the -inf that often marks masked places,
+            counts as masked.
         positions: ``(*B, S, D)`` or broadcastable, for example pixels or inverse depths.
         mask: ``(*B, S)`` bool, True = possible; the others may hold anything.
-        window: keep only places at most this many steps from the peak, so that a second mode
-            elsewhere does not pull the mean between the two.
+        window: keep only places at most this many steps (0 or more) from the peak, so that a
+            second mode elsewhere does not pull the mean between the two.
 
     Returns:
         Finite numbers always; where every place is masked all of them are 0.
+
+    Raises:
+        ShapeError: a trailing shape differs, or there is no place.
+        TypeError: the mask is not bool.
+        ValueError: the window is negative.
 
     Source: the paper, equations 2 and 3.
 
@@ -76,8 +84,11 @@ def soft_argmax(
         >>> soft_argmax(logits, torch.tensor([[1.0], [2.0], [3.0]])).position
         tensor([2.])
     """
-    check_shapes(logits=(logits, "S"), positions=(positions, "S D"))
-    possible = torch.ones_like(logits, dtype=torch.bool) if mask is None else mask
+    check_shapes(logits=(logits, "+S"), positions=(positions, "S D"))
+    check_bool(mask=mask)
+    if window is not None and window < 0:
+        raise ValueError(f"window must not be negative, got {window}")
+    possible = logits.isfinite() if mask is None else mask & logits.isfinite()
     lowest = torch.finfo(logits.dtype).min / 4
     probability = torch.where(possible, logits, lowest).softmax(dim=-1)
     probability = torch.where(possible, probability, 0.0)
@@ -119,6 +130,7 @@ def matches_from_sources(
     )
 
 
+@full_precision
 def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor:
     """Weights in 1/px from the covariance of matches, as triangulation's covariance reads them.
 
@@ -154,6 +166,7 @@ def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor
     return torch.where(known, torch.where(known, variance, 1.0).rsqrt(), 0.0)
 
 
+@full_precision
 def match_per_view(
     keypoints: Tensor, scores: Tensor, samples: Samples, *, window: int | None = None
 ) -> Matches:
@@ -164,7 +177,8 @@ def match_per_view(
 
     Args:
         keypoints: ``(*B, N, 2)`` of the anchor.
-        scores: ``(*B, V-1, N, O, S)`` logits, for example a scaled :func:`deltas_geom.correlate`.
+        scores: ``(*B, V-1, N, O, S)`` logits, for example a scaled :func:`deltas_geom.correlate`;
+            those that are not finite count as masked.
         samples: the places scored.
         window: see :func:`soft_argmax`; only without offsets (O = 1).
 
@@ -178,11 +192,13 @@ def match_per_view(
         mask=samples.mask.flatten(-2),
         window=window,
     )
+    # The largest of S probabilities is 1 / S or more, where any place is possible.
     return matches_from_sources(
-        keypoints, found.position, found.peak, found.covariance, samples.mask.flatten(-2).any(-1)
+        keypoints, found.position, found.peak, found.covariance, found.peak > 0
     )
 
 
+@full_precision
 def match_joint(
     views: PosedViews,
     keypoints: Tensor,
@@ -200,7 +216,8 @@ def match_joint(
     Args:
         views: the anchor (view 0) and its V-1 sources.
         keypoints: ``(*B, N, 2)`` of the anchor.
-        scores: ``(*B, V-1, N, 1, S)`` logits at ``samples``.
+        scores: ``(*B, V-1, N, 1, S)`` logits at ``samples``; those that are not finite count as
+            not seen in their view.
         samples: from :func:`deltas_geom.sample_inv_depths`.
         image_size: (height, width) of the sources.
         window: see :func:`soft_argmax`.
@@ -209,9 +226,11 @@ def match_joint(
         The projections of the one decided depth into the sources that can see it, weight =
         peak of the joint distribution.
     """
-    seen = samples.mask.squeeze(-2)
+    check_bool(mask=samples.mask)
+    scores = scores.squeeze(-2)
+    seen = samples.mask.squeeze(-2) & scores.isfinite()
     count = seen.sum(dim=-3)
-    mean = safe_divide(torch.where(seen, scores.squeeze(-2), 0.0).sum(dim=-3), count, count > 0)
+    mean = safe_divide(torch.where(seen, scores, 0.0).sum(dim=-3), count, count > 0)
     inv_depth = samples.inv_depth.select(-3, 0)
     found = soft_argmax(mean, inv_depth[..., None], mask=count > 0, window=window)
     return matches_at(

@@ -13,8 +13,9 @@ from torch import Tensor
 from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.observations import NEGLIGIBLE_WEIGHT, solver_dtype
+from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
 from deltas_geom.poses import camera_centers
+from deltas_geom.precision import full_precision
 from deltas_geom.status import Status
 from deltas_geom.triangulation import Triangulation
 from deltas_geom.uncertainty import parallax_of
@@ -23,6 +24,7 @@ _Vector = tuple[Tensor, ...]
 """Three components, each of any shape."""
 
 
+@full_precision
 def triangulate_midpoint(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
 ) -> Triangulation:
@@ -44,7 +46,8 @@ def triangulate_midpoint(
         RMS angle, rad; ``covariance`` None. Parallax below 3e-7 rad counts as none.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or there is no view.
+        TypeError: the mask is not bool.
 
     Source: Szeliski, Computer Vision, 2nd ed., section 11.2.4.
 
@@ -59,6 +62,7 @@ def triangulate_midpoint(
     return _triangulate(cam_from_world, rays, weights, mask, stepped=False)
 
 
+@full_precision
 def triangulate_inverse_depth_weighted(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
 ) -> Triangulation:
@@ -90,10 +94,8 @@ def triangulate_inverse_depth_weighted(
 def _triangulate(
     cameras: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None, *, stepped: bool
 ) -> Triangulation:
-    check_shapes(cam_from_world=(cameras, "V 4 4"), rays=(rays, "V N 3"))
-    for name, tensor in (("weights", weights), ("mask", mask)):
-        if tensor is not None:
-            check_shapes(**{name: (tensor, "V N"), "rays": (rays, "V N 3")})
+    check_shapes(cam_from_world=(cameras, "+V 4 4"), rays=(rays, "V N 3"))
+    check_weights(weights, mask, "rays", rays, "V N 3", cameras.shape[:-3])
     dtype = rays.dtype
 
     def solve(*inputs: Tensor) -> tuple[Tensor, ...]:

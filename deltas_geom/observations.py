@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.chunks import values_at_hand
 
 # A view whose weight is below this share of the point's largest counts as no view: its squared
@@ -148,7 +148,7 @@ class Cameras(NamedTuple):
 
 def cameras_of(proj: Tensor) -> Cameras:
     """Tell finite cameras ``(*B, V, 3, 4)`` from others."""
-    check_shapes(proj=(proj, "V 3 4"))
+    check_shapes(proj=(proj, "+V 3 4"))
     work = solver_dtype(proj)
     limit = torch.finfo(work).max ** 0.25
     finite = (proj.detach().to(work).abs() < limit).all(-1).all(-1)
@@ -185,7 +185,8 @@ def observe(
         mask: see :func:`weigh`.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or there is no view.
+        TypeError: the mask is not bool.
     """
     cameras = cameras_of(proj)
     xy, weighed = weigh_pixels(cameras, pixels, weights, mask)
@@ -236,11 +237,12 @@ def check_weights(
     dims: str,
     batch: torch.Size,
 ) -> torch.Size:
-    """Raise :class:`ShapeError` unless weights and mask ``(*B, V, N)`` fit what is weighed.
+    """Raise unless weights and mask ``(*B, V, N)`` fit what is weighed, and the mask is bool.
 
     Returns:
         The batch dims to which all broadcast.
     """
+    check_bool(mask=mask)
     shapes = [batch, seen.shape[:-3]]
     for label, tensor in (("weights", weights), ("mask", mask)):
         if tensor is not None:

@@ -8,6 +8,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import invert_pose
+from deltas_geom.precision import full_precision, promoted
 from deltas_geom.views import PosedViews
 
 
@@ -27,6 +28,7 @@ class Projection(NamedTuple):
     in_front: Tensor
 
 
+@full_precision
 def project(views: PosedViews, points: Tensor) -> Projection:
     """Project world points into every view.
 
@@ -49,7 +51,8 @@ def project(views: PosedViews, points: Tensor) -> Projection:
     finite = points.isfinite().all(dim=-1)
     # A NaN would reach the gradient of every camera through the product below.
     known = torch.where(finite[..., None], points, 0.0)
-    homogeneous = to_homogeneous(known).unsqueeze(-3) @ views.proj.mT
+    known, proj = promoted(known, views.proj)
+    homogeneous = to_homogeneous(known).unsqueeze(-3) @ proj.mT
     exists = finite.unsqueeze(-2) & homogeneous.isfinite().all(dim=-1)
     depth = torch.where(exists, homogeneous[..., 2], 0.0)
     # Pixels and 1 / depth enter the gradient squared, times the size of the point.
@@ -60,6 +63,7 @@ def project(views: PosedViews, points: Tensor) -> Projection:
     return Projection(pixels, depth, in_front)
 
 
+@full_precision
 def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
     """World points seen at pixels of each view, at a depth along its z axis.
 
@@ -75,11 +79,13 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
         ShapeError: a trailing shape differs.
     """
     check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"), depth=(depth, "V N"))
-    rays = pixel_rays(views.K, pixels)
-    world_from_cam = invert_pose(views.cam_from_world)
+    K, cam_from_world, pixels, depth = promoted(*views, pixels, depth)
+    rays = pixel_rays(K, pixels)
+    world_from_cam = invert_pose(cam_from_world)
     return to_homogeneous(rays * depth[..., None]) @ world_from_cam[..., :3, :].mT
 
 
+@full_precision
 def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
     """Rays through pixels in the camera's own frame, scaled to depth 1.
 

@@ -5,8 +5,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_image_size, check_shapes
+from deltas_geom.checks import check_bool, check_image_size, check_shapes
 from deltas_geom.homogeneous import safe_divide
+from deltas_geom.precision import full_precision, promoted
 
 
 class SparseDepth(NamedTuple):
@@ -21,6 +22,7 @@ class SparseDepth(NamedTuple):
     weight: Tensor
 
 
+@full_precision
 def rasterize_depth(
     pixels: Tensor,
     depth: Tensor,
@@ -50,6 +52,7 @@ def rasterize_depth(
 
     Raises:
         ShapeError: a trailing shape differs.
+        TypeError: the mask is not bool.
 
     Source: the paper, section 3.3.
 
@@ -61,7 +64,9 @@ def rasterize_depth(
     """
     check_image_size(image_size)
     check_shapes(pixels=(pixels, "N 2"), depth=(depth, "N"))
+    check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
+    pixels, depth, given = promoted(pixels, depth, given)
     used = depth.isfinite() & (depth > 0) & given.isfinite() & (given > 0)
     used = used & pixels.isfinite().all(dim=-1)
     if mask is not None:

@@ -23,6 +23,7 @@ from deltas_geom.observations import (
     weigh,
 )
 from deltas_geom.poses import camera_centers
+from deltas_geom.precision import full_precision
 from deltas_geom.rig_frame import (
     FoundPoints,
     RigFrame,
@@ -38,6 +39,7 @@ from deltas_geom.triangulation import Triangulation
 from deltas_geom.uncertainty import parallax_of
 
 
+@full_precision
 def triangulate_rays(
     cam_from_world: Tensor,
     rays: Tensor,
@@ -60,7 +62,8 @@ def triangulate_rays(
         ray of length 0 counts as not finite.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or there is no view.
+        TypeError: the mask is not bool.
 
     Source: Hartley and Zisserman, 2nd ed., section 12.2, with the cross product's three rows
     in place of two.
@@ -73,7 +76,7 @@ def triangulate_rays(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    check_shapes(cam_from_world=(cam_from_world, "V 4 4"), rays=(rays, "V N 3"))
+    check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), rays=(rays, "V N 3"))
     check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
 
     def known(seen: _Seen, points: Vector3, status: Tensor) -> tuple[Tensor, ...]:

@@ -15,6 +15,7 @@ from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.normal_matrix import Symmetric3, normal_matrix, second_derivative, solve3_scaled
 from deltas_geom.observations import Observations, Vector3, check_weights, observe, over_views
+from deltas_geom.precision import full_precision
 
 Loss = Literal["squared", "huber", "cauchy"]
 
@@ -40,6 +41,7 @@ class Refined(NamedTuple):
     valid: Tensor
 
 
+@full_precision
 def refine_points(
     proj: Tensor,
     pixels: Tensor,
@@ -81,7 +83,7 @@ def refine_points(
         Points, residual, could they be refined? Nothing raises or turns NaN because of values.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError, TypeError: a trailing shape differs, there is no view, the mask is not bool.
         ValueError: unknown loss or gradient, negative number of steps, scale not positive.
 
     Source: Hartley and Zisserman, 2nd ed., appendix 6, and section 5.2.6 (implicit functions);
@@ -97,7 +99,7 @@ def refine_points(
         >>> refined.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"), points=(points, "N 3"))
+    check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"), points=(points, "N 3"))
     batch = batch_shape(proj.shape[:-3], points.shape[:-2])
     check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
     if loss not in ("squared", "huber", "cauchy"):

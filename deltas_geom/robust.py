@@ -11,6 +11,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import to_homogeneous
 from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
+from deltas_geom.precision import full_precision
 from deltas_geom.status import Status
 from deltas_geom.triangulation import triangulate, triangulate_points
 
@@ -41,6 +42,7 @@ class RobustTriangulation(NamedTuple):
     inliers: Tensor
 
 
+@full_precision
 def triangulate_robust(
     proj: Tensor,
     pixels: Tensor,
@@ -84,7 +86,7 @@ def triangulate_robust(
         inliers as its mask: none to outliers. Nothing raises or turns NaN because of values.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError, TypeError: a trailing shape differs, there is no view, the mask is not bool.
         ValueError: a threshold that is not positive, ``min_inliers`` below 2, no pairs.
 
     Source: Torr and Zisserman, MLESAC (2000), section 3 (the cost, MSAC); Chum, Matas and
@@ -95,12 +97,10 @@ def triangulate_robust(
         >>> proj[:, 0, 3] = torch.tensor([0.0, -20, -40, -60])  # 20 cm to the right, each
         >>> pixels = torch.tensor([[60.0, 45], [50, 45], [90, 10], [30, 45]])[:, None]
         >>> result = triangulate_robust(proj, pixels)
-        >>> result.inliers[:, 0]
-        tensor([ True,  True, False,  True])
-        >>> result.points.round(decimals=3)
-        tensor([[0.2000, 0.1000, 2.0000]])
+        >>> result.inliers[:, 0].tolist(), result.points.round(decimals=3)
+        ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
-    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"))
+    check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"))
     check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
     if not threshold > 0:
         raise ValueError(f"threshold must be positive, got {threshold}")

@@ -10,6 +10,7 @@ from torch import Tensor
 from deltas_geom.checks import batch_shape, check_image_size, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.pixels import in_image, normalize_pixels
+from deltas_geom.precision import full_precision
 from deltas_geom.segments import Segments, epipolar_rays
 from deltas_geom.views import PosedViews
 
@@ -28,6 +29,7 @@ class Samples(NamedTuple):
     mask: Tensor
 
 
+@full_precision
 def sample_segments(
     segments: Segments,
     num_samples: int,
@@ -84,6 +86,7 @@ def sample_segments(
     return Samples(pixels, inv_depth, mask)
 
 
+@full_precision
 def sample_inv_depths(
     views: PosedViews, pixels: Tensor, inv_depths: Tensor, *, image_size: tuple[int, int]
 ) -> Samples:
@@ -115,6 +118,7 @@ def sample_inv_depths(
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
 
 
+@full_precision
 def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     """Read a feature map of any stride at pixels of the image, bilinearly.
 
@@ -133,14 +137,14 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
         pixel.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or the map is empty.
 
     Example:
         >>> ramp = torch.arange(4.0).reshape(1, 1, 4)  # one row of four pixels
         >>> sample_map(ramp, torch.tensor([[1.5, 0.0]]), image_size=(1, 4))
         tensor([[1.5000]])
     """
-    check_shapes(feature_map=(feature_map, "D h w"), pixels=(pixels, "N 2"))
+    check_shapes(feature_map=(feature_map, "D +h +w"), pixels=(pixels, "N 2"))
     batch = batch_shape(feature_map.shape[:-3], pixels.shape[:-2])
     # The count, not -1: a reshape of no keypoints cannot infer it.
     count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]

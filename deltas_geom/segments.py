@@ -14,6 +14,7 @@ from deltas_geom.checks import check_depth_range, check_image_size, check_shapes
 from deltas_geom.fundamental import inverse_intrinsics
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
+from deltas_geom.precision import full_precision, promoted
 from deltas_geom.projection import pixel_rays
 from deltas_geom.status import Status
 from deltas_geom.views import PosedViews
@@ -90,16 +91,15 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
         views: the anchor (view 0) and its V-1 sources.
         pixels: ``(*B, N, 2)`` keypoints of the anchor.
     """
-    check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "N 2"))
-    source_from_anchor = relative_pose(
-        views.cam_from_world[..., 1:, :, :], views.cam_from_world[..., :1, :, :]
-    )
-    K_source = views.K[..., 1:, :, :]
+    check_shapes(K=(views.K, "+V 3 3"), pixels=(pixels, "N 2"))
+    K, cam_from_world, pixels = promoted(*views, pixels)
+    source_from_anchor = relative_pose(cam_from_world[..., 1:, :, :], cam_from_world[..., :1, :, :])
+    K_source = K[..., 1:, :, :]
     # NaN is not below, either.
     usable = (pixels.detach().abs() < torch.finfo(pixels.dtype).max ** 0.75).all(dim=-1)
     # A NaN would reach the gradient of every camera through the products below.
     known = torch.where(usable[..., None], pixels, 0.0)
-    rays = pixel_rays(views.K[..., 0, :, :], known).unsqueeze(-3)
+    rays = pixel_rays(K[..., 0, :, :], known).unsqueeze(-3)
     translation = source_from_anchor[..., :3, 3:]
     origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
     slope = (K_source @ translation).mT
@@ -107,13 +107,13 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
         share = torch.finfo(origin.dtype).eps ** _CLEARANCE
         clearance = share * rays.abs().amax(dim=-1)
         clearance_slope = share * translation.abs().amax(dim=-2)
-        poses = views.cam_from_world.abs()
-        to_source = views.K[..., 1:, :, :].abs() @ poses[..., 1:, :3, :3]
+        poses = cam_from_world.abs()
+        to_source = K_source.abs() @ poses[..., 1:, :3, :3]
         from_anchor = poses[..., :1, :3, :3].mT
-        homography = to_source @ from_anchor @ inverse_intrinsics(views.K[..., :1, :, :]).abs()
+        homography = to_source @ from_anchor @ inverse_intrinsics(K[..., :1, :, :]).abs()
         terms = to_homogeneous(known.abs()).unsqueeze(-3) @ homography.mT
         slope_terms = to_source @ from_anchor @ poses[..., :1, :3, 3:]
-        slope_terms = slope_terms + views.K[..., 1:, :, :].abs() @ poses[..., 1:, :3, 3:]
+        slope_terms = slope_terms + K_source.abs() @ poses[..., 1:, :3, 3:]
     return EpipolarRays(
         origin,
         slope,
@@ -125,6 +125,7 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     )
 
 
+@full_precision
 def epipolar_segments(
     views: PosedViews,
     pixels: Tensor,
@@ -149,7 +150,7 @@ def epipolar_segments(
         float32 that rounding is smaller if the world's origin is near the cameras.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or there is no view.
         ValueError: the depth range or the image size makes no sense.
 
     Source: the paper, section 3.2 and figure 3; clipping as in Liang and Barsky (1984).

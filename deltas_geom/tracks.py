@@ -9,10 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import ShapeError, check_shapes
+from deltas_geom.checks import ShapeError, check_index, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Vector3
+from deltas_geom.precision import full_precision
 from deltas_geom.recompute import recomputed
 from deltas_geom.rig_frame import (
     FoundPoints,
@@ -45,6 +46,7 @@ class TriangulatedTracks(NamedTuple):
     residual: Tensor
 
 
+@full_precision
 def triangulate_tracks(
     proj: Tensor,
     pixels: Tensor,
@@ -71,8 +73,10 @@ def triangulate_tracks(
 
     Raises:
         ShapeError: a shape differs.
+        TypeError: an index is not of integers.
         ValueError: ``num_points`` is negative.
-        IndexError or RuntimeError: by torch, an index is out of range.
+        IndexError or RuntimeError: by torch, an index is out of range. (On a GPU torch may tell
+            later, or end the process: check lists of unknown origin before they go there.)
 
     Source: Hartley and Zisserman, 2nd ed., section 12.2.
 
@@ -99,6 +103,7 @@ def triangulate_tracks(
         camera_index=(camera_index, "T"),
         point_index=(point_index, "T"),
     )
+    check_index(camera_index=camera_index, point_index=point_index)
     if weights is not None:
         check_shapes(pixels=(pixels, "T 2"), weights=(weights, "T"))
     # A list has no batch: cameras and points of all scenes may share one list instead.

@@ -22,6 +22,7 @@ from deltas_geom.equations import (
 )
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Cameras, Observations, Vector3
+from deltas_geom.precision import full_precision
 from deltas_geom.recompute import WithLagrangian
 from deltas_geom.rig_frame import (
     FoundPoints,
@@ -66,6 +67,7 @@ class Triangulation(NamedTuple):
     covariance: Tensor | None
 
 
+@full_precision
 def triangulate_points(
     proj: Tensor,
     pixels: Tensor,
@@ -109,6 +111,7 @@ def triangulate_points(
     return in_chunks(function, values, proj, points, dims=(-2, -1, -1), prepare=prepare)[0]
 
 
+@full_precision
 def triangulate(
     proj: Tensor,
     pixels: Tensor,
@@ -131,10 +134,11 @@ def triangulate(
         covariance: also compute the covariance of the points.
 
     Returns:
-        Points with status. Nothing raises or turns NaN because of values.
+        Points with status, in the dtype of ``proj``. Nothing raises or turns NaN because of values.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or there is no view.
+        TypeError: the mask is not bool.
 
     Source: Hartley and Zisserman, 2nd ed., section 12.2; weights as in the paper, section
     3.2, after Iskakov et al. (2019).

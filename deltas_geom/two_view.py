@@ -10,10 +10,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.fundamental import cross_matrix
 from deltas_geom.observations import solver_dtype
+from deltas_geom.precision import full_precision
 from deltas_geom.status import Status
 
 
@@ -40,6 +41,7 @@ class TwoViewTriangulation(NamedTuple):
     parallax: Tensor
 
 
+@full_precision
 def triangulate_two_view(
     proj: Tensor, pixels: Tensor, mask: Tensor | None = None
 ) -> TwoViewTriangulation:
@@ -56,7 +58,7 @@ def triangulate_two_view(
         one point in 1000; pixels within their noise of an epipole may have another minimum.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError, TypeError: a trailing shape differs, the mask is not bool.
 
     Source: Lindstrom, Triangulation Made Easy (CVPR 2010), algorithm niter2.
 
@@ -73,6 +75,7 @@ def triangulate_two_view(
     check_shapes(proj=(proj, "2 3 4"), pixels=(pixels, "2 N 2"))
     if mask is not None:
         check_shapes(mask=(mask, "2 N"), pixels=(pixels, "2 N 2"))
+        check_bool(mask=mask)
     dtype = torch.promote_types(proj.dtype, pixels.dtype)
 
     def outward(seen: _Seen, solved: _Solved, status: Tensor) -> tuple[Tensor, ...]:

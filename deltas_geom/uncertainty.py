@@ -5,12 +5,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.normal_matrix import Symmetric3, inverse3, normal_matrix
 from deltas_geom.observations import Vector3, projection_centers, solver_dtype
+from deltas_geom.precision import full_precision, promoted
 
 
+@full_precision
 def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
     """Weighted RMS distance of projections from pixels, ``(*B, N)`` px.
 
@@ -21,7 +23,12 @@ def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights:
         weights: ``(*B, V, N)``; views of weight 0, and those behind which a point lies, do not
             count. 0 where no view counts.
     """
-    check_shapes(proj=(proj, "V 3 4"), pixels=(pixels, "V N 2"), weights=(weights, "V N"))
+    check_shapes(
+        proj=(proj, "+V 3 4"),
+        points=(points, "N 3"),
+        pixels=(pixels, "V N 2"),
+        weights=(weights, "V N"),
+    )
     work = solver_dtype(proj)
     size = weights.detach().abs().amax(dim=-2, keepdim=True)
     share = weights.to(work) / torch.where(size > 0, size, 1.0)
@@ -30,6 +37,7 @@ def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights:
     return residual_of(seen, pixels.to(work).mT, share * share).to(proj.dtype)
 
 
+@full_precision
 def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     """Largest angle between the rays of used views at a point, ``(*B, N)`` rad.
 
@@ -38,13 +46,15 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
         points: ``(*B, N, 3)``.
         used: ``(*B, V, N)`` bool.
     """
-    check_shapes(proj=(proj, "V 3 4"), points=(points, "N 3"), used=(used, "V N"))
+    check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
+    check_bool(used=used)
     work = solver_dtype(proj)
     centers = projection_centers(proj.detach().to(work))
     x, y, z = points.detach().to(work).unbind(dim=-1)
     return parallax_of(centers, (x, y, z), used.to(work)).to(proj.dtype)
 
 
+@full_precision
 def point_covariance(
     proj: Tensor, points: Tensor, weights: Tensor, *, pose_covariance: Tensor | None = None
 ) -> Tensor:
@@ -59,7 +69,8 @@ def point_covariance(
         weights: ``(*B, V, N)``; 0 = unused.
         pose_covariance: ``(*B, V, 6, 6)`` of each camera's centre (m) and rotation vector (rad),
             both along the world's axes, independent from view to view; adds what uncertain
-            poses do to points that minimise the reprojection error.
+            poses do to points that minimise the reprojection error. Taken as
+            it is: where it is no covariance (a negative variance), nor is the result.
 
     Returns:
         0 where fewer than two views see the point. A direction in which nothing is known has a
@@ -74,7 +85,7 @@ def point_covariance(
         >>> noise.diagonal(dim1=-2, dim2=-1)
         tensor([[ 2.,  2., 32.]])
     """
-    check_shapes(proj=(proj, "V 3 4"), points=(points, "N 3"), weights=(weights, "V N"))
+    check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), weights=(weights, "V N"))
     work = solver_dtype(proj)
     camera = proj.to(work)
     x, y, z = points.to(work).unbind(dim=-1)
@@ -82,13 +93,14 @@ def point_covariance(
     squared = weights.to(work).square()
     found = unpacked3(covariance_of(camera, seen, squared))
     if pose_covariance is not None:
-        check_shapes(proj=(proj, "V 3 4"), pose_covariance=(pose_covariance, "V 6 6"))
+        check_shapes(proj=(proj, "+V 3 4"), pose_covariance=(pose_covariance, "V 6 6"))
         noise = pose_covariance.to(work)
         found = found + _of_poses(camera, points.to(work), seen, squared, found, noise)
     limit = torch.finfo(proj.dtype).max
     return found.to(proj.dtype).nan_to_num(limit).clamp(-limit, limit)
 
 
+@full_precision
 def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
     """Variance ``(*B, V, N)`` m^2 of points' depths in views, from the points' covariance.
 
@@ -100,8 +112,9 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         >>> depth_variance(torch.eye(3, 4)[None], torch.diag(torch.tensor([1.0, 2.0, 9.0]))[None])
         tensor([[9.]])
     """
-    check_shapes(proj=(proj, "V 3 4"), covariance=(covariance, "N 3 3"))
-    axis = proj[..., 2, :3].to(covariance.dtype)
+    check_shapes(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
+    proj, covariance = promoted(proj, covariance)
+    axis = proj[..., 2, :3]
     along = torch.einsum("...vi,...nij->...vnj", axis, covariance)
     return torch.einsum("...vnj,...vj->...vn", along, axis)
 

@@ -12,6 +12,7 @@ import deltas_geom
 PACKAGE = Path(deltas_geom.__file__).parent
 ORDER = [
     "checks",
+    "precision",
     "homogeneous",
     "pixels",
     "poses",

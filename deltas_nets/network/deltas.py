@@ -95,6 +95,11 @@ class Deltas(nn.Module):
         self.densifier = stages.densifier
 
     @property
+    def dtype(self) -> torch.dtype:
+        """Of the weights: what images are cast to, and cameras too, but to float32 at least."""
+        return next(self.parameters()).dtype
+
+    @property
     def calibration(self) -> SpreadCalibration:
         """What makes the standard deviation of the dense map true."""
         return self.densifier.calibration
@@ -112,7 +117,8 @@ class Deltas(nn.Module):
         """Predict the depth of view 0.
 
         Args:
-            images: ``(*B, V, 3, H, W)`` RGB in [0, 1]; view 0 is the anchor, V >= 2.
+            images: ``(*B, V, 3, H, W)`` RGB in [0, 1]; view 0 is the anchor, V >= 2. Of any
+                floating dtype, as are the cameras: both are cast to that of the weights.
             views: their cameras, ``(*B, V)``.
             depth_range: (near, far) of the search, metres.
             num_keypoints: instead of the config's.
@@ -122,7 +128,7 @@ class Deltas(nn.Module):
                 the widest view needs.
 
         Raises:
-            ShapeError: a trailing shape differs, or there is no source.
+            ShapeError: a trailing shape differs, there is no source, or the batch is empty.
             ValueError: the depth range makes no sense, or the refinement is not positive.
             TypeError: the images are integers.
         """
@@ -134,6 +140,8 @@ class Deltas(nn.Module):
             raise TypeError(f"images must be floating point in [0, 1], got {images.dtype}")
         if images.shape[-4] < 2:
             raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
+        if 0 in images.shape:
+            raise ShapeError(f"images must not be empty, got {tuple(images.shape)}")
         batch, size = images.shape[:-4], (images.shape[-2], images.shape[-1])
         flat = PosedViews(
             *(t.expand(*batch, *t.shape[-3:]).reshape(-1, *t.shape[-3:]) for t in views)
@@ -155,7 +163,7 @@ class Deltas(nn.Module):
         Args:
             images: ``(B, V, 3, H, W)`` RGB in [0, 1].
         """
-        features = self.encoder(images)
+        features = self.encoder(images.to(self.dtype))
         return Encoded(features, self.descriptor(features))
 
     def from_encoded(
@@ -181,6 +189,7 @@ class Deltas(nn.Module):
             refinement: as for :meth:`forward`.
         """
         features, descriptors = encoded
+        views = views.to(torch.promote_types(self.dtype, torch.float32))
         keypoints = self.detector(
             features, image_size=image_size, num_keypoints=num_keypoints, shift=shift
         )

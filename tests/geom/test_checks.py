@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from deltas_geom import ShapeError
-from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
+from deltas_geom.checks import (
+    batch_shape,
+    check_bool,
+    check_depth_range,
+    check_image_size,
+    check_index,
+    check_shapes,
+)
 
 
 def test_a_wrong_trailing_dim_is_named() -> None:
@@ -43,3 +50,22 @@ def test_far_may_be_infinite() -> None:
 def test_an_image_has_a_pixel() -> None:
     with pytest.raises(ValueError, match="height, width"):
         check_image_size((0, 3))
+
+
+def test_a_plus_asks_for_one_or_more() -> None:
+    check_shapes(weights=(torch.zeros(3, 0), "+V N"))
+    with pytest.raises(ShapeError, match=r"weights must have V >= 1, got \(0, 3\)"):
+        check_shapes(weights=(torch.zeros(0, 3), "+V N"))
+    with pytest.raises(ShapeError, match=r"map must have shape \(\*B, D, h\), got \(2,\)"):
+        check_shapes(map=(torch.zeros(2), "D +h"))
+
+
+def test_masks_are_bool_and_indices_are_integers() -> None:
+    check_bool(mask=None, used=torch.ones(2, dtype=torch.bool))
+    check_index(index=torch.ones(2, dtype=torch.int32))
+    for wrong in (torch.ones(2), torch.ones(2, dtype=torch.int64)):
+        with pytest.raises(TypeError, match="mask must be bool, True = used, got torch"):
+            check_bool(mask=wrong)
+    for wrong in (torch.ones(2), torch.ones(2, dtype=torch.bool)):
+        with pytest.raises(TypeError, match="index must hold integers, got torch"):
+            check_index(index=wrong)

@@ -1,0 +1,133 @@
+"""Arguments of any operation that are empty or of a wrong kind: an answer or an error in words."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from operations import METHODS, OPERATIONS, RANGE, SIZE, Given, given_in
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+import deltas_geom as geom
+
+ALL = OPERATIONS | METHODS
+MASKED = [
+    "correlate",
+    "correlate_normalized",
+    "match_joint",
+    "match_per_view",
+    "rasterize_depth",
+    "ray_parallax",
+    "refine_points",
+    "soft_argmax",
+    "triangulate",
+    "triangulate_inverse_depth_weighted",
+    "triangulate_midpoint",
+    "triangulate_points, weights",
+    "triangulate_rays",
+    "triangulate_robust",
+    "triangulate_two_view",
+]
+
+
+def without_points(given: Given) -> Given:
+    views, points, inv_depths = given.views, given.points, given.inv_depths
+    return Given(
+        views,
+        given.pixels[:, :0],
+        points[:0],
+        given.weights[:, :0],
+        given.mask[:, :0],
+        given.descriptors[:0],
+        given.maps,
+        given.scores[:, :0],
+        inv_depths,
+    )
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_no_points_are_fine(name: str) -> None:
+    found = ALL[name](without_points(given_in(torch.float32)))
+    tensors = [leaf for leaf in tree_leaves(found) if isinstance(leaf, Tensor)]
+    assert all(tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point())
+
+
+NO_PROJ, NO_PIXELS, NO_RAYS = torch.zeros(0, 3, 4), torch.zeros(0, 2, 2), torch.zeros(0, 2, 3)
+NO_VIEWS = geom.PosedViews(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4))
+POINTS, NO_WEIGHTS = torch.zeros(2, 3), torch.zeros(0, 2)
+
+WITHOUT_VIEWS: dict[str, Callable[[], Any]] = {
+    "epipolar_segments": lambda: geom.epipolar_segments(
+        NO_VIEWS, torch.zeros(2, 2), depth_range=RANGE, image_size=SIZE
+    ),
+    "point_covariance": lambda: geom.point_covariance(NO_PROJ, POINTS, NO_WEIGHTS),
+    "ray_parallax": lambda: geom.ray_parallax(NO_PROJ, POINTS, NO_WEIGHTS > 0),
+    "refine_points": lambda: geom.refine_points(NO_PROJ, NO_PIXELS, POINTS),
+    "reprojection_residual": lambda: geom.reprojection_residual(
+        NO_PROJ, POINTS, NO_PIXELS, NO_WEIGHTS
+    ),
+    "sample_inv_depths": lambda: geom.sample_inv_depths(
+        NO_VIEWS, torch.zeros(2, 2), torch.ones(4), image_size=SIZE
+    ),
+    "triangulate": lambda: geom.triangulate(NO_PROJ, NO_PIXELS),
+    "triangulate, weights": lambda: geom.triangulate(NO_PROJ, NO_PIXELS, NO_WEIGHTS),
+    "triangulate_midpoint": lambda: geom.triangulate_midpoint(NO_VIEWS.cam_from_world, NO_RAYS),
+    "triangulate_points": lambda: geom.triangulate_points(NO_PROJ, NO_PIXELS),
+    "triangulate_rays": lambda: geom.triangulate_rays(NO_VIEWS.cam_from_world, NO_RAYS),
+    "triangulate_robust": lambda: geom.triangulate_robust(NO_PROJ, NO_PIXELS),
+    "triangulate_two_view": lambda: geom.triangulate_two_view(NO_PROJ, NO_PIXELS),
+}
+
+
+@pytest.mark.parametrize("name", WITHOUT_VIEWS)
+def test_without_views_there_is_an_error_in_words(name: str) -> None:
+    with pytest.raises(geom.ShapeError, match=r"must have (V >= 1|shape \(\*B, 2)"):
+        WITHOUT_VIEWS[name]()
+
+
+def test_without_places_or_pixels_of_a_map_there_is_an_error_in_words() -> None:
+    with pytest.raises(geom.ShapeError, match="logits must have S >= 1"):
+        geom.soft_argmax(torch.zeros(3, 0), torch.zeros(3, 0, 2))
+    with pytest.raises(geom.ShapeError, match="feature_map must have h >= 1"):
+        geom.sample_map(torch.zeros(5, 0, 4), torch.zeros(2, 2), image_size=SIZE)
+    given = given_in(torch.float32)
+    with pytest.raises(geom.ShapeError, match="feature_map must have w >= 1"):
+        geom.correlate(given.descriptors, given.maps[..., :0], given.at_depths, image_size=SIZE)
+
+
+class WithFloatMasks(Given):
+    """Masks hold numbers."""
+
+    @property
+    def beside_lines(self) -> geom.Samples:
+        samples = super().beside_lines
+        return samples._replace(mask=samples.mask.float())
+
+    @property
+    def at_depths(self) -> geom.Samples:
+        samples = super().at_depths
+        return samples._replace(mask=samples.mask.float())
+
+
+def masked_soft_argmax(given: Given) -> Any:
+    return geom.soft_argmax(given.weights, given.pixels, mask=given.mask)
+
+
+@pytest.mark.parametrize("name", MASKED)
+def test_a_mask_of_numbers_is_an_error_in_words(name: str) -> None:
+    given = WithFloatMasks(*given_in(torch.float32))._replace(mask=torch.ones(3, 6))
+    with pytest.raises(TypeError, match=r"(mask|used) must be bool, .* got torch\.float32"):
+        (OPERATIONS | {"soft_argmax": masked_soft_argmax})[name](given)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.bool], ids=str)
+def test_indices_of_tracks_are_integers(kind: torch.dtype) -> None:
+    proj, pixels, index = torch.eye(3, 4).repeat(2, 1, 1), torch.zeros(2, 2), torch.tensor([0, 1])
+    with pytest.raises(TypeError, match="camera_index must hold integers"):
+        geom.triangulate_tracks(proj, pixels, index.to(kind), index, 2)
+    with pytest.raises(TypeError, match="point_index must hold integers"):
+        geom.triangulate_tracks(proj, pixels, index, index.to(kind), 2)
+    for camera in (index + 1, index - 1):
+        with pytest.raises((IndexError, RuntimeError), match="out of"):
+            geom.triangulate_tracks(proj, pixels, camera, index, 2)
