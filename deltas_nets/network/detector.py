@@ -141,12 +141,13 @@ def _best(heatmap: Tensor, config: DetectorConfig, count: int) -> tuple[Tensor, 
     border, window = config.border, 2 * config.nms_radius + 1
     peaks = nms2d(heatmap, (window, window))[:, 0]
     inner = torch.zeros_like(peaks)
-    inner[:, border:-border, border:-border] = peaks[:, border:-border, border:-border]
-    width = heatmap.shape[-1]
+    height, width = heatmap.shape[-2:]
+    rows, columns = slice(border, height - border), slice(border, width - border)
+    inner[:, rows, columns] = peaks[:, rows, columns]
     wanted = min(int(count * config.detected_share), inner[0].numel())
     scores, index = inner.flatten(1).topk(wanted, dim=1)
-    columns, rows = index % width, index.div(width, rounding_mode="floor")
-    return torch.stack([columns, rows], dim=-1).to(heatmap.dtype), scores
+    row = index.div(width, rounding_mode="floor")
+    return torch.stack([index % width, row], dim=-1).to(heatmap.dtype), scores
 
 
 def detector_heatmap(logits: Tensor, *, image_size: tuple[int, int]) -> Tensor:

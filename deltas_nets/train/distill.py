@@ -49,15 +49,15 @@ class DistillConfig:
     """The network with its new detector, a .safetensors file."""
     init: str = DEFAULT
     """The network to start from: a shipped one, or a weights file."""
-    steps: int = 3000
+    steps: int = 4000
     """Optimiser steps."""
     batch_size: int = 16
     """Pictures per step."""
     learning_rate: float = 3e-3
     """At the start; it falls to a hundredth along half a cosine."""
-    num_images: int = 1200
+    num_images: int = 1500
     """Pictures that the teacher labels."""
-    adaptation: int = 12
+    adaptation: int = 10
     """Ways in which the teacher looks at each of them, warped by random homographies: it keeps
     what it finds from most sides. 1: as it is."""
     looks: int = 2
@@ -68,8 +68,8 @@ class DistillConfig:
     procedural rooms."""
     labels: Literal["soft", "hard"] = "soft"
     """What the student learns: how good every point is, or where the points are."""
-    gain: float = 1.0
-    """soft: factor of the teacher's scores, where they are small."""
+    gain: float = 2.0
+    """soft: factor of the teacher's scores, which are small, the more so a mean of many looks."""
     fine_width: int = 16
     """Width of the detector's fine branch, if the network has none yet; 0 adds none."""
     threshold: float = 0.1
