@@ -10,6 +10,7 @@ import math
 import os
 import re
 import secrets
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
@@ -23,6 +24,7 @@ from deltas_nets.errors import UserError
 __all__ = [
     "TEMPORARY",
     "cannot_write",
+    "check_writable",
     "plain",
     "read_depth_png",
     "read_points_ply",
@@ -148,6 +150,25 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(opened)
         finally:
             os.close(opened)
+
+
+def check_writable(out: Path) -> None:
+    """Whether a folder can be made and filled; nothing of it is made.
+
+    A file is written where it would be: permission bits mislead on network drives and root.
+
+    Raises:
+        UserError: it is a file, or the system refuses.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError("this is a file, not a folder", out, "name a folder with --out")
+    parents = (out, *out.absolute().parents)
+    nearest = next(folder for folder in parents if folder.exists())
+    try:
+        with tempfile.NamedTemporaryFile(dir=nearest, prefix=".", suffix=".deltas-tmp") as file:
+            file.write(b"x")
+    except OSError as error:
+        raise cannot_write(out, error) from error
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

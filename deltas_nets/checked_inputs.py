@@ -48,10 +48,14 @@ def usable_view_sets(
     if num_views is not None and num_views < 2:
         raise UserError("too few views", f"--views {num_views}", "use 2 or more")
     if file is None:
-        return choose_view_sets(capture, num_views or 5)
-    view_sets = read_view_sets(file, capture)
+        view_sets = choose_view_sets(capture, num_views or 5)
+    else:
+        view_sets = read_view_sets(file, capture)
     if num_views is None:
         return view_sets
+    most = 1 + max(len(views.sources) for views in view_sets)
+    if most < num_views:
+        warn(f"no map is from {num_views} views: there are at most {most} that go together")
     return tuple(views._replace(sources=views.sources[: num_views - 1]) for views in view_sets)
 
 
@@ -76,8 +80,10 @@ def check_all(
         check_frames(capture, view_sets, with_depth=with_depth, report=report)
 
 
-def warn_of_lost(capture: Capture, view_sets_file: Path | None) -> None:
-    """One warning that names the frames which have no pose and are left out."""
+def warn_of(capture: Capture, view_sets_file: Path | None) -> None:
+    """Warnings of what may be a mistake, and one that names the frames without a pose."""
+    for doubt in capture.doubts:
+        warn(doubt)
     if capture.lost and view_sets_file is None:
         words = ids_in_words(sorted(capture.lost))
         warn(f"frames without a usable pose are left out: {words}")

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -42,7 +43,7 @@ class Train:
     resume: Flag = False
     """Go on from the checkpoint in --out, with the config recorded there. Only what changes no
     result may be given anew: --devices, --num-nodes, --data.cache, --data.workers, --root."""
-    init: Path | None = None
+    init: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Start from these weights."""
     start_step: int = 0
     """Go on in the schedule at this step (with --init)."""
@@ -60,10 +61,12 @@ class Train:
     def run(self) -> None:
         """Do it."""
         from deltas_nets.checked_inputs import encoder_file
+        from deltas_nets.outputs import check_writable
         from deltas_nets.train.fit import fit
         from deltas_nets.train.resume import resumed_config
         from deltas_nets.train.start import Start
 
+        self._check_counts()
         if self.start_step and self.init is None:
             raise UserError("start from what?", "--start-step", "add --init FILE")
         config = self.config
@@ -80,6 +83,7 @@ class Train:
             raise UserError(
                 "the folder holds another run", self.out, "add --resume or name a new folder"
             )
+        check_writable(self.out)
         fresh = not self.resume and self.init is None
         wanted = fresh and (config.network.backbone == "lite" or self.encoder != "pretrained")
         encoder = encoder_file(self.encoder) if wanted else None
@@ -93,6 +97,13 @@ class Train:
         )
         if os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0":
             print(f"weights in {weights}")
+
+    def _check_counts(self) -> None:
+        for name, least in (("start_step", 0), ("checkpoint_every", 1), ("validate_every", 1)):
+            value = getattr(self, name)
+            if value < least:
+                option = f"--{name.replace('_', '-')} {value}"
+                raise UserError("too few steps", option, f"give {least} or more")
 
 
 @dataclass(frozen=True)
@@ -147,7 +158,7 @@ class Cost:
 
 def preset_of(arguments: list[str]) -> Network:
     """What --config names: the defaults of the other flags depend on it."""
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for word, following in pairwise([*arguments, ""]):
         name = word.partition("=")[2] if word.startswith("--config=") else following
         for network in NETWORKS:
             if word.partition("=")[0] == "--config" and name == network:

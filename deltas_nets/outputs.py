@@ -3,13 +3,13 @@
 Files in it are whole (`deltas_nets.atomic_files`), so a frame whose files all exist is
 finished, whenever the run before was killed. Where the network states no confidence there is no
 folder confidence. summary.json says what made the files: written at the start (status
-``running``) and at the end (``complete``). Several shards may fill one folder; each keeps its own
+``running``) and at the end (``complete``); what it does not hold yet is in
+`deltas_nets.frame_records`. Several shards may fill one folder; each keeps its own
 summary.I-of-N.json beside the summary of all.
 """
 
 import json
 import os
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from deltas_nets.atomic_files import (
     TEMPORARY,
     cannot_write,
+    check_writable,
     plain,
     read_depth_png,
     read_points_ply,
@@ -27,8 +28,8 @@ from deltas_nets.atomic_files import (
     write_json,
     write_points_ply,
 )
-from deltas_nets.data.view_sets import ViewSet
 from deltas_nets.errors import UserError
+from deltas_nets.frame_records import FrameRecords, read_records, remove_records
 from deltas_nets.summary import (
     SHARD_SUMMARY,
     SUMMARY,
@@ -44,7 +45,6 @@ __all__ = [
     "prepare_output",
     "read_depth_png",
     "read_points_ply",
-    "recorded_view_sets",
     "write_confidence_png",
     "write_depth_png",
     "write_json",
@@ -73,6 +73,8 @@ class OutputFolder:
         self._head = head
         self._frames = frames  # records of this run and of those it continues, by id
         self._shard = shard
+        own = path / SUMMARY if shard[1] == 1 else shard_summary(path, shard)
+        self._records = FrameRecords(own)
 
     def file(self, kind: str, id: FrameId) -> Path:
         """Where a frame's ``depth``, ``confidence`` or ``points`` are written."""
@@ -107,6 +109,8 @@ class OutputFolder:
         """
         if (probability is not None) != ("confidence" in self.kinds):
             raise ValueError(f"the folder holds {', '.join(self.kinds)}")
+        # First: a frame is finished with the last of its files, and then it has a record.
+        self._records.add(id, record)
         write_points_ply(self.file("points", id), points, colors)
         if probability is not None:
             write_confidence_png(self.file("confidence", id), probability)
@@ -117,6 +121,13 @@ class OutputFolder:
         """Count a frame that an earlier run finished; its record is kept where it had one."""
         self._frames.setdefault(str(id), {"status": "kept"})
 
+    def recover(self, ids: Iterable[FrameId] | None) -> None:
+        """Take over what killed runs had recorded of frames they finished; of these, if not all."""
+        wanted = None if ids is None else set(map(str, ids))
+        for id, record in read_records(self.path).items():
+            if self.is_finished(id) and (wanted is None or id in wanted):
+                self._frames[id] = record
+
     def write_summary(self, status: str, **more: Any) -> None:
         """Write the summary: ``running`` at the start and in between, then how it ended.
 
@@ -126,9 +137,13 @@ class OutputFolder:
         """
         self._head = self._head | more
         content = self._head | {"status": status, "frames": self._frames}
-        if self._shard[1] == 1:
+        if self._shard[1] > 1:
+            self._write_shard_summary(content)
+        else:
             write_json(self.path / SUMMARY, content)
-            return
+        self._records.remove()
+
+    def _write_shard_summary(self, content: dict[str, Any]) -> None:
         write_json(shard_summary(self.path, self._shard), content)
         # Others may finish between our reading and our writing. Who writes last reads once
         # more, so the summary that stays has seen everything.
@@ -153,8 +168,13 @@ class OutputFolder:
             frames |= earlier["frames"]
         for part in parts:
             frames |= part["frames"]
-        complete = [part["status"] for part in parts] == ["complete"] * self._shard[1]
-        return own | {"status": "complete" if complete else "running", "frames": frames}
+        statuses = [part["status"] for part in parts]
+        if statuses == ["complete"] * self._shard[1]:
+            status = "complete"
+        else:
+            stopped = "stopped" in statuses and "running" not in statuses
+            status = "stopped" if stopped else "running"
+        return own | {"status": status, "frames": frames}
 
 
 def prepare_output(
@@ -200,9 +220,10 @@ def prepare_output(
         raise UserError("the output folder is a capture", out, "name another folder with --out")
     check_writable(out)
     # Listed before the summaries are read: what another shard has made by now has a summary.
-    others = [name for name in sorted(os.listdir(out)) if not TEMPORARY.match(name)]
+    found = sorted(os.listdir(out)) if out.exists() else []
+    others = [name for name in found if not TEMPORARY.match(name)]
     summaries = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
-    earlier = [found for name in summaries if (found := read_summary(out / name)) is not None]
+    earlier = [read for name in summaries if (read := read_summary(out / name)) is not None]
     if not overwrite:
         if others and not earlier:
             what = f"the output folder holds something else ({', '.join(others[:3])})"
@@ -211,7 +232,7 @@ def prepare_output(
             what = f"an earlier run had other settings ({difference(earlier[0], wanted)})"
             raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
     own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
-    frames = {} if overwrite or own is None else dict(own["frames"])
+    frames = {} if own is None else dict(own["frames"])
     folder = OutputFolder(
         out,
         kinds=kinds,
@@ -223,11 +244,14 @@ def prepare_output(
             "settings": wanted,
             "anchors": frame_ids,
         },
-        frames=frames,
+        frames={} if overwrite else frames,
         shard=shard,
     )
+    if not overwrite:
+        folder.recover(None if shard[1] == 1 else frame_ids)
     try:
         # Before the new summary: killed in between, the old one still says what made the rest.
+        out.mkdir(parents=True, exist_ok=True)
         if overwrite:
             planned = {id for summary in earlier for id in summary.get("anchors", ())}
             _remove_frames(out, {*frame_ids, *(planned if shard[1] == 1 else ())})
@@ -236,41 +260,13 @@ def prepare_output(
         if shard[1] == 1:
             _remove_temporary(out)
         folder.write_summary("running")
+        if shard[1] == 1:
+            remove_records(out)
         for kind in kinds:
             (out / kind).mkdir(exist_ok=True)
     except OSError as error:
         raise cannot_write(Path(error.filename or out), error) from error
     return folder
-
-
-def check_writable(out: Path) -> None:
-    """Make the folder and write a file: permission bits mislead on network drives and root.
-
-    Raises:
-        UserError: it is a file, or the system refuses.
-    """
-    if out.exists() and not out.is_dir():
-        raise UserError("this is a file, not a folder", out, "name a folder with --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=out, prefix=".", suffix=".deltas-tmp") as file:
-            file.write(b"x")
-    except OSError as error:
-        raise cannot_write(out, error) from error
-
-
-def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
-    """The view sets of the run that filled a folder.
-
-    Raises:
-        UserError: no run of `deltas depth` did.
-    """
-    summary = read_summary(out / SUMMARY)
-    if summary is None or "view_sets" not in summary["settings"]:
-        raise UserError("no run of deltas depth is recorded", out / SUMMARY, "run it first")
-    return tuple(
-        ViewSet(anchor, tuple(sources)) for anchor, sources in summary["settings"]["view_sets"]
-    )
 
 
 def _file(out: Path, kind: str, id: FrameId) -> Path:

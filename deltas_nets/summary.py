@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from deltas_nets.data.view_sets import ViewSet
+from deltas_nets.errors import UserError
+
 WRITER = "deltas depth"
 """Stands in summary.json and tells our folders from others."""
 SUMMARY = "summary.json"
@@ -27,6 +30,20 @@ def read_summary(path: Path) -> dict[str, Any] | None:
         return None
     dicts = all(isinstance(content.get(key), dict) for key in ("settings", "frames"))
     return content if dicts else None
+
+
+def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
+    """The view sets of the run that filled a folder.
+
+    Raises:
+        UserError: no run of `deltas depth` did.
+    """
+    summary = read_summary(out / SUMMARY)
+    if summary is None or "view_sets" not in summary["settings"]:
+        raise UserError("no run of deltas depth is recorded", out / SUMMARY, "run it first")
+    return tuple(
+        ViewSet(anchor, tuple(sources)) for anchor, sources in summary["settings"]["view_sets"]
+    )
 
 
 def difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ import dataclasses
 from deltas_nets.config.network import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.config.training import DataConfig, LossConfig, TrainConfig
 
-_PAPER_DETECTOR = DetectorConfig(num_keypoints=512, nms_radius=9, border=4)
+_PAPER_DETECTOR = DetectorConfig(num_keypoints=512, nms_radius=9, border=4, fine_width=0)
 _PAPER_MATCHER = MatcherConfig(kind="per_view", num_samples=100)
 
 CONFIGS: dict[str, NetworkConfig] = {

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from deltas_nets.config.checks import check_at_least, check_finite, check_positive, check_share
+
 
 @dataclass(frozen=True)
 class DetectorConfig:
@@ -18,13 +20,14 @@ class DetectorConfig:
     """Detections are at least this far apart, pixels (the paper: 9 at 240 x 320)."""
     border: int = 2
     """Nothing is detected nearer to the image border, pixels."""
-    fine_width: int = 0
-    """Channels of the branch at half the image's resolution, which says where in its cell a point
-    is; 0 is none."""
+    fine_width: int = 16
+    """lite: channels of the branch at half the image's resolution, which says where in its cell a
+    point is; 0 is none."""
 
     def __post_init__(self) -> None:
-        if self.num_keypoints < 8:
-            raise ValueError(f"num_keypoints must be at least 8, got {self.num_keypoints}")
+        check_at_least(0, self, "nms_radius", "border", "fine_width")
+        check_at_least(8, self, "num_keypoints")
+        check_share(self, "threshold")
         if not 0 <= self.detected_share <= 1:
             raise ValueError(f"detected_share must be within [0, 1], got {self.detected_share}")
 
@@ -54,12 +57,13 @@ class MatcherConfig:
     """joint: the 2D match may move this far along the epipolar line, pixels."""
 
     def __post_init__(self) -> None:
-        if self.num_samples < 8:
-            raise ValueError(f"num_samples must be at least 8, got {self.num_samples}")
-        if not self.step > 0:
-            raise ValueError(f"step must be positive, got {self.step}")
-        if self.max_refinement < 1:
-            raise ValueError(f"max_refinement must be at least 1, got {self.max_refinement}")
+        check_at_least(0, self, "context_rounds", "window", "refine_radius")
+        check_at_least(1, self, "max_refinement", "context_heads")
+        check_at_least(8, self, "num_samples")
+        check_positive(self, "step")
+        check_finite(self, "offsets")
+        if not self.offsets:
+            raise ValueError("offsets must name a line, for example 0")
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,7 @@ class NetworkConfig:
                 f"densifier_widths must be {wanted} numbers for {self.backbone}, got "
                 f"{self.densifier_widths}"
             )
+        check_at_least(1, self, "descriptor_dim", "head_width", "densifier_widths")
         if self.backbone != "lite" and self.matcher.kind == "joint":
             raise ValueError(f"the joint matcher needs the lite backbone, got {self.backbone}")
         if self.backbone != "lite" and self.descriptor_stride != 2:

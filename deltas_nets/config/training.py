@@ -1,10 +1,11 @@
 """What a training run depends on: losses, data and schedule."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Literal
 
 import tyro
 
+from deltas_nets.config.checks import check_at_least, check_positive, check_seed, check_share
 from deltas_nets.config.network import NetworkConfig
 from deltas_nets.data.scannet_config import ScanNetConfig
 
@@ -34,6 +35,9 @@ class LossConfig:
     spread: float = 0.2
     """Laplace likelihood of the dense map's own uncertainty."""
 
+    def __post_init__(self) -> None:
+        check_at_least(0, self, *(term.name for term in fields(self)))
+
 
 @dataclass(frozen=True)
 class DataConfig:
@@ -54,7 +58,7 @@ class DataConfig:
     """Height of the images that are rendered or read, pixels."""
     width: int = 256
     """Width of the images that are rendered or read, pixels."""
-    cache: str | None = None
+    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder that keeps rendered rooms, 7 bytes a pixel of every view, or ScanNet's poses, 0.15 KB
     a frame; without it they are rendered or read each time."""
     workers: int = 1
@@ -71,6 +75,11 @@ class DataConfig:
     def __post_init__(self) -> None:
         if self.source == "rooms" and self.scannet != ScanNetConfig():
             raise ValueError("--root and the other options of ScanNet need --data scannet")
+        check_seed(self)
+        check_at_least(0, self, "workers")
+        check_at_least(1, self, "num_rooms")
+        check_at_least(2, self, "num_views")
+        check_at_least(32, self, "height", "width")
         if self.replay < 1 or self.shelf < 1:
             raise ValueError(
                 f"replay and shelf must be at least 1, got {self.replay} and {self.shelf}"
@@ -146,9 +155,12 @@ class TrainConfig:
                 f"views must satisfy 2 <= min_views <= max_views <= data.num_views, got "
                 f"{self.min_views}, {self.max_views}, {most}"
             )
-        for name in ("steps", "batch_size", "accumulate", "devices", "num_nodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_seed(self)
+        check_at_least(0, self, "weight_decay", "warmup", "pose_noise")
+        check_at_least(1, self, "steps", "batch_size", "accumulate", "devices", "num_nodes")
+        check_at_least(8, self, "num_keypoints")
+        check_positive(self, "learning_rate", "encoder_rate", "clip_gradient")
+        check_share(self, "average")
         if self.batch_size % self.accumulate:
             raise ValueError(
                 f"batch_size must be a multiple of accumulate, got {self.batch_size} and "

@@ -35,6 +35,8 @@ class Frame:
     depth_path: Path | None = None
     depth_K: FloatArray | None = None
     """(3, 3) intrinsics of the depth image; None where it sees what the colour image sees."""
+    depth_size: tuple[int, int] | None = None
+    """(height, width) of the depth image; None where any will do."""
 
     def read_image(self) -> NDArray[np.uint8]:
         """Decode the whole image.
@@ -45,7 +47,7 @@ class Frame:
         Raises:
             UserError: the file is missing, damaged, truncated, not 8-bit, or of another size.
         """
-        remedy = "copy the file again, or take the frame out of the view sets"
+        remedy = "copy the file again, or remove it (and the frame from view sets)"
         image = _decode(self.image_path, remedy=remedy)
         if image.mode.startswith(("I", "F")):
             # Pillow would clip these to white without a word.
@@ -64,7 +66,8 @@ class Frame:
             ``(H, W)`` metres at the depth image's own size, 0 where unknown.
 
         Raises:
-            UserError: the frame has none, or the file is damaged or not a 16-bit image.
+            UserError: the frame has none, or the file is damaged, not a 16-bit image, or of another
+                size.
         """
         if self.depth_path is None:
             file = self.image_path.parent.parent / "depth" / f"{self.id}.png"
@@ -73,6 +76,11 @@ class Frame:
         if not image.mode.startswith("I"):
             what = f"depth has pixels of type {image.mode}, not 16-bit millimetres"
             raise UserError(what, self.depth_path, "export depth as a 16-bit grey PNG")
+        if self.depth_size not in (None, (image.height, image.width)):
+            height, width = self.depth_size
+            of = "the others are" if self.depth_K is None else "the intrinsics are for"
+            what = f"depth is {image.width}x{image.height}, {of} {width}x{height}"
+            raise UserError(what, self.depth_path, "export all depth of a capture at one size")
         millimetres = np.asarray(image).astype(np.int64)
         unknown = (millimetres <= 0) | (millimetres >= UNKNOWN_DEPTH)
         return np.where(unknown, 0.0, millimetres / 1000.0).astype(np.float32)
@@ -88,6 +96,8 @@ class Capture:
     """Frames with a usable pose, in the order of their ids."""
     lost: Mapping[int, UserError]
     """Frames left out because of their pose, with the error that asking for them raises."""
+    doubts: tuple[str, ...] = ()
+    """What may be a mistake, each for a warning."""
 
     def fingerprint(self) -> str:
         """A hash of all cameras: what changes when poses or intrinsics do."""

@@ -17,7 +17,7 @@ from deltas_nets.data.scannet_scenes import LeftOut, Scene, read_scene
 
 __all__ = ["read_scene_cached"]
 
-VERSION = 1
+VERSION = 2
 """Raised whenever the same files give another scene."""
 
 
@@ -73,7 +73,9 @@ def _save(file: Path, scene: Scene) -> None:
         tensors[name] = words.view(np.uint8).reshape(len(words), words.itemsize)
     metadata = {
         "image_size": json.dumps(scene.image_size),
+        "depth_size": json.dumps(scene.depth_size),
         "left_out": json.dumps(asdict(scene.left_out)),
+        "doubts": json.dumps(scene.doubts),
     }
     content = save({name: np.ascontiguousarray(t) for name, t in tensors.items()}, metadata)
     write_atomically(file, lambda opened: opened.write(content))
@@ -88,6 +90,7 @@ def _load(file: Path, path: Path) -> Scene | None:
     except (SafetensorError, OSError):
         return None
     height, width = json.loads(metadata["image_size"])
+    depth_size = json.loads(metadata["depth_size"])
 
     def words(name: str) -> NDArray[np.bytes_]:
         letters = np.ascontiguousarray(tensors[name])
@@ -98,9 +101,11 @@ def _load(file: Path, path: Path) -> Scene | None:
         image_size=(height, width),
         K=tensors["K"],
         depth_K=tensors.get("depth_K"),
+        depth_size=None if depth_size is None else (depth_size[0], depth_size[1]),
         ids=tensors["ids"],
         cam_from_world=tensors["cam_from_world"],
         images=words("images"),
         depths=words("depths"),
         left_out=LeftOut(**json.loads(metadata["left_out"])),
+        doubts=tuple(json.loads(metadata["doubts"])),
     )

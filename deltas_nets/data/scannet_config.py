@@ -1,6 +1,7 @@
 """Which frames of ScanNet a training looks at, and which of them together."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Annotated, Literal
 
 import tyro
@@ -29,7 +30,7 @@ class ScanNetConfig:
     Frames without a finite, rigid pose or without depth are left out anyway."""
     tuples: Literal["gap", "baseline"] = "gap"
     """scannet: views are so many frames apart, before and after the anchor; or so many metres."""
-    gap: int | None = None
+    gap: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """scannet: frames from one view to the next; if not given, the paper's: 20 for 2 and 3
     views, 15 for 4, 12 for 5, 10 for 7."""
     baseline: Annotated[tuple[float, float], tyro.conf.arg(metavar="LOW HIGH")] = (0.05, 0.25)
@@ -40,7 +41,7 @@ class ScanNetConfig:
     def __post_init__(self) -> None:
         if self.gap is not None and self.gap < 1:
             raise ValueError(f"gap must be at least 1, got {self.gap}")
-        if not 0 < self.baseline[0] < self.baseline[1]:
+        if not 0 < self.baseline[0] < self.baseline[1] < inf:
             raise ValueError(f"baseline must be 0 < low < high metres, got {self.baseline}")
         if not 0 < self.max_rotation <= 180:
             raise ValueError(f"max_rotation must be within (0, 180], got {self.max_rotation}")

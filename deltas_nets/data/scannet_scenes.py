@@ -55,22 +55,26 @@ class Scene(NamedTuple):
         image_size: (height, width) of the colour images.
         K: ``(3, 3)`` of the colour images.
         depth_K: ``(3, 3)`` of the depth images; None where they see what the images see.
+        depth_size: (height, width) of the depth images; None if none decodes.
         ids: ``(F,)`` int64 frame numbers, ascending.
         cam_from_world: ``(F, 4, 4)`` float64, rigid.
         images: ``(F,)`` names of files in color, ASCII.
         depths: ``(F,)`` names of files in depth, ASCII.
         left_out: frames that are not among them.
+        doubts: what may be a mistake, each for a warning.
     """
 
     path: Path
     image_size: tuple[int, int]
     K: FloatArray
     depth_K: FloatArray | None
+    depth_size: tuple[int, int] | None
     ids: NDArray[np.int64]
     cam_from_world: FloatArray
     images: NDArray[np.bytes_]
     depths: NDArray[np.bytes_]
     left_out: LeftOut
+    doubts: tuple[str, ...]
 
     def frame(self, position: int) -> Frame:
         """The frame at a position, for reading its pixels."""
@@ -82,6 +86,7 @@ class Scene(NamedTuple):
             cam_from_world=self.cam_from_world[position],
             depth_path=self.path / "depth" / self.depths[position].decode(),
             depth_K=self.depth_K,
+            depth_size=self.depth_size,
         )
 
     def without(self, listed: NDArray[np.bool_]) -> "Scene":
@@ -132,11 +137,13 @@ def read_scene(path: Path) -> Scene:
         image_size=files.image_size,
         K=files.K,
         depth_K=files.depth_K,
+        depth_size=files.depth_size,
         ids=ids,
         cam_from_world=np.array(list(usable.values()), dtype=np.float64).reshape(-1, 4, 4),
         images=np.array([files.images[id].name.encode() for id in usable], dtype=np.bytes_),
         depths=np.array([files.depths[id].name.encode() for id in usable], dtype=np.bytes_),
         left_out=LeftOut(lost, not_rigid, without_depth),
+        doubts=files.doubts,
     )
 
 

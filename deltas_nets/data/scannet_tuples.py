@@ -102,7 +102,7 @@ def open_scannet(
         image_size: (height, width) of the items.
         cache: folder that keeps poses.
         option: which option named the split, for errors.
-        report: gets a line of what there is and one of what is missing.
+        report: gets a line of what there is, one of what is doubtful and one of what is missing.
 
     Raises:
         UserError: there is no root, no scene, no tuple; or a file of a scene is malformed.
@@ -132,6 +132,10 @@ def open_scannet(
         remedy = "check the numbers of the frames, --data.skip, and --data.gap or --data.baseline"
         raise UserError(f"there are no {rule.in_words()} ({counts})", root, remedy)
     report(f"{option} {Path(split).name}: {len(found)} times {rule.in_words()}; {counts}")
+    doubtful = [doubt for scene in scenes.values() for doubt in scene.doubts]
+    if doubtful:
+        more = f" (and {len(doubtful) - 1} warnings more)" if len(doubtful) > 1 else ""
+        report(f"warning: {doubtful[0]}{more}")
     if missing:
         total = len(folders) + len(missing)
         report(f"{len(missing)} of its {total} scenes are not there: {ids_in_words(missing)}")

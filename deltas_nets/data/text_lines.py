@@ -23,3 +23,28 @@ def read_lines(path: Path, *, name: str, remedy: str) -> Iterator[tuple[int, lis
         words = line.partition("#")[0].split()
         if words:
             yield number, words
+
+
+def read_numbers(path: Path, *, name: str, remedy: str) -> list[float]:
+    """Numbers between spaces.
+
+    Args:
+        path: the file.
+        name: what it holds, for errors.
+        remedy: what the user can do.
+
+    Raises:
+        UserError: it is not text, or a word, which the error shows, is no number.
+    """
+    try:
+        words = path.read_text(encoding="utf-8").split()
+    except UnicodeDecodeError as error:
+        raise UserError(f"the {name} file is not text", path, remedy) from error
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError as error:
+            what = f"the {name} file holds {word[:20]!r} where a number should be"
+            raise UserError(what, path, remedy) from error
+    return numbers

@@ -1,11 +1,15 @@
 """Configs: what is recorded comes back, nonsense is refused."""
 
 import json
+from dataclasses import fields
+from math import inf, nan
 
 import pytest
 
 from deltas_nets.config import (
     DataConfig,
+    DetectorConfig,
+    LossConfig,
     MatcherConfig,
     NetworkConfig,
     TrainConfig,
@@ -51,7 +55,40 @@ def test_nonsense_is_refused_in_the_users_words() -> None:
         DataConfig(scannet=ScanNetConfig(root="somewhere"))
     with pytest.raises(ValueError, match="gap must be at least 1"):
         ScanNetConfig(gap=0)
+    with pytest.raises(ValueError, match="baseline must be 0 < low < high"):
+        ScanNetConfig(baseline=(0.1, inf))
+    with pytest.raises(ValueError, match="offsets must name a line"):
+        MatcherConfig(offsets=())
     TrainConfig(data=FRAMES, max_views=7)  # of rooms, 5 views are rendered
+
+
+def numeric_fields(kind: type) -> list[tuple[type, str]]:
+    """Fields of a config that hold a number, or some."""
+    defaults = kind()
+    values = ((field.name, getattr(defaults, field.name)) for field in fields(kind))
+    one_of_two = {"descriptor_stride"}
+    return [(kind, name) for name, value in values if numbers_in(value) and name not in one_of_two]
+
+
+def numbers_in(value: object) -> bool:
+    first = value[0] if isinstance(value, tuple) and value else value
+    return isinstance(first, int | float) and not isinstance(first, bool)
+
+
+CONFIGS = (TrainConfig, DataConfig, LossConfig, NetworkConfig, DetectorConfig, MatcherConfig)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [pair for kind in CONFIGS for pair in numeric_fields(kind)]
+)
+def test_no_number_is_nan_infinite_or_below_its_least(kind: type, name: str) -> None:
+    usual = getattr(kind(), name)
+    wrong: list[float] = [] if name == "offsets" else [-1]  # lines to either side
+    wrong += [nan, inf] if isinstance(usual, float | tuple) else []
+    for number in wrong:
+        value = (number, *usual[1:]) if isinstance(usual, tuple) else number
+        with pytest.raises(ValueError, match=f"{name}.*, got .*{number}"):
+            kind(**{name: value})
 
 
 def test_what_is_shown_to_others_has_names_but_no_folders() -> None:

@@ -1,12 +1,14 @@
 """ScanNet's export layout: color/N.jpg, depth/N.png, pose/N.txt, intrinsic/*.txt."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from deltas_nets.data.capture import Capture, FloatArray, Frame, ids_in_words, image_size_of
+from deltas_nets.data.readers.intrinsics import doubtful_centre, read_intrinsics
+from deltas_nets.data.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
 __all__ = [
@@ -28,11 +30,6 @@ RIGID_TOLERANCE = 2e-3
 """Largest entry of R^T R - I. Six digits after the point give 1e-5, 7-Scenes as published
 1.5e-4; a scale of 0.1 %, the least that would matter to metric depth, gives 2e-3."""
 
-SPREAD = (0.35, 0.65)
-"""Where a principal point lies, in parts of the image. Cameras are within 0.45 to 0.55; wider,
-because a refusal has no way around it. Images resized by 0.76 or 1.43 are found."""
-
-
 _NO_POSE = "repair it or take the frame out of the view sets"
 
 
@@ -46,6 +43,8 @@ class SceneFiles(NamedTuple):
         image_size: (height, width) of the colour images.
         K: ``(3, 3)`` of the colour images.
         depth_K: ``(3, 3)`` of the depth images; None where they see what the images see.
+        depth_size: (height, width) of the depth images; None if there are none that decode.
+        doubts: what may be a mistake, each for a warning.
     """
 
     images: Mapping[int, Path]
@@ -54,6 +53,8 @@ class SceneFiles(NamedTuple):
     image_size: tuple[int, int]
     K: FloatArray
     depth_K: FloatArray | None
+    depth_size: tuple[int, int] | None
+    doubts: tuple[str, ...]
 
 
 def recognises(path: Path) -> bool:
@@ -65,33 +66,34 @@ def recognises(path: Path) -> bool:
 def read(path: Path) -> Capture:
     """Read one scene; see `deltas_nets.data.capture.open_capture` for the contract."""
     scene = _find_scene(path)
-    images, poses, depths, image_size, K, depth_K = find_files(scene)
+    files = find_files(scene)
     frames: dict[int, Frame] = {}
     lost: dict[int, UserError] = {}
-    for id, image_path in images.items():
-        if id not in poses:
+    for id, image_path in files.images.items():
+        if id not in files.poses:
             file = scene / "pose" / f"{id}.txt"
             lost[id] = UserError(f"frame {id} has no pose file", file, _NO_POSE)
             continue
-        world_from_cam = read_pose(poses[id])
+        pose = files.poses[id]
+        world_from_cam = read_pose(pose)
         if not np.isfinite(world_from_cam).all():
-            lost[id] = UserError(f"the pose of frame {id} is not finite", poses[id], _NO_POSE)
+            lost[id] = UserError(f"the pose of frame {id} is not finite", pose, _NO_POSE)
             continue
-        cam_from_world = world_from_cam_inverse(world_from_cam, path=poses[id])
-        depth_path = depths.get(id)
+        depth_path = files.depths.get(id)
         frames[id] = Frame(
             id=id,
             image_path=image_path,
-            image_size=image_size,
-            K=K,
-            cam_from_world=cam_from_world,
+            image_size=files.image_size,
+            K=files.K,
+            cam_from_world=world_from_cam_inverse(world_from_cam, path=pose),
             depth_path=depth_path,
-            depth_K=None if depth_path is None else depth_K,
+            depth_K=None if depth_path is None else files.depth_K,
+            depth_size=None if depth_path is None else files.depth_size,
         )
     if not frames:
         what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(lost)})"
         raise UserError(what, scene / "pose", "run the tracking again")
-    return Capture(path=scene, frames=frames, lost=lost)
+    return Capture(path=scene, frames=frames, lost=lost, doubts=files.doubts)
 
 
 def find_files(scene: Path) -> SceneFiles:
@@ -122,14 +124,23 @@ def find_files(scene: Path) -> SceneFiles:
         remedy = "name each pose file like its image: pose/7.txt for color/7.jpg"
         raise UserError(what, scene / "pose", remedy)
 
-    image_size = _common_size(list(images.values()))
-    K = _read_intrinsics(scene / "intrinsic" / "intrinsic_color.txt", image_size)
+    image_size = _common_size(images.values())
+    if image_size is None:
+        what = f"none of the {len(images)} images can be decoded"
+        raise UserError(what, next(iter(images.values())), "copy the files again")
+    file = scene / "intrinsic" / "intrinsic_color.txt"
+    K = read_intrinsics(file, image_size)
+    doubts = [_misnamed(scene / "color"), doubtful_centre(K, image_size, file)]
+    depth_size = _common_size(depths.values())
     depth_K = None
-    depth_intrinsics = scene / "intrinsic" / "intrinsic_depth.txt"
+    depth_file = scene / "intrinsic" / "intrinsic_depth.txt"
     # Registered depth often comes without a file of its own: None says "as the colour image".
-    if depths and depth_intrinsics.exists():
-        depth_K = _read_intrinsics(depth_intrinsics, _common_size(list(depths.values())))
-    return SceneFiles(images, poses, depths, image_size, K, depth_K)
+    if depths and depth_file.exists():
+        depth_K = read_intrinsics(depth_file, depth_size)
+    elif depth_size is not None:
+        doubts.append(_other_shape(depth_size, image_size, depth_file))
+    said = tuple(doubt for doubt in doubts if doubt is not None)
+    return SceneFiles(images, poses, depths, image_size, K, depth_K, depth_size, said)
 
 
 def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
@@ -190,10 +201,10 @@ def _find_scene(path: Path) -> Path:
 
 
 def _files_by_id(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Files named by a number, in the order of the numbers; others are not ours to judge."""
+    """Files named by a number, in the order of the numbers."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in suffixes or not (path.stem.isascii() and path.stem.isdigit()):
+        if path.suffix.lower() not in suffixes or not _is_number(path.stem):
             continue
         id = int(path.stem)
         if id in found:
@@ -203,34 +214,45 @@ def _files_by_id(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _common_size(paths: Sequence[Path]) -> tuple[int, int]:
+def _is_number(name: str) -> bool:
+    return name.isascii() and name.isdigit()
+
+
+def _misnamed(folder: Path) -> str | None:
+    """A warning that names a file with the number or the suffix of an image, but not both."""
+    found = sorted(
+        path.name
+        for path in folder.iterdir()
+        if (path.suffix.lower() in IMAGE_SUFFIXES) != _is_number(path.stem)
+        and not path.name.startswith(".")
+    )
+    if not found:
+        return None
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return f"left out, {folder / found[0]}{more}: images are N.jpg or N.png, N a number"
+
+
+def _other_shape(
+    depth_size: tuple[int, int], image_size: tuple[int, int], missing: Path
+) -> str | None:
+    """A warning where depth cannot show what the images show: one of them is turned or cropped."""
+    (rows, columns), (height, width) = depth_size, image_size
+    if 0.95 < rows * width / (height * columns) < 1.05:
+        return None
+    return (
+        f"depth of {columns}x{rows} is taken to show what images of {width}x{height} show, for "
+        f"there is no {missing}"
+    )
+
+
+def _common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """Size of the first readable image: one intrinsic file serves all, so they have one size.
 
     Only one header is read: 2000 would take seconds on a network drive, and reading an image
     checks its size against this one. A damaged first file is no obstacle while nobody needs it.
     """
-    for path in paths:
-        size = image_size_of(path)
-        if size is not None:
-            return size
-    remedy = "copy the files again"
-    raise UserError(f"none of the {len(paths)} images can be decoded", paths[0], remedy)
-
-
-def _read_numbers(path: Path, *, name: str, remedy: str) -> list[float]:
-    """Numbers between spaces; the error shows the first word that is none."""
-    try:
-        words = path.read_text(encoding="utf-8").split()
-    except UnicodeDecodeError as error:
-        raise UserError(f"the {name} file is not text", path, remedy) from error
-    numbers = []
-    for word in words:
-        try:
-            numbers.append(float(word))
-        except ValueError as error:
-            what = f"the {name} file holds {word[:20]!r} where a number should be"
-            raise UserError(what, path, remedy) from error
-    return numbers
+    sizes = (image_size_of(path) for path in paths)
+    return next((size for size in sizes if size is not None), None)
 
 
 def read_pose(path: Path) -> FloatArray:
@@ -240,54 +262,7 @@ def read_pose(path: Path) -> FloatArray:
         UserError: the file does not hold 16 numbers.
     """
     remedy = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
-    numbers = _read_numbers(path, name="pose", remedy=remedy)
+    numbers = read_numbers(path, name="pose", remedy=remedy)
     if len(numbers) != 16:
         raise UserError(f"the pose file has {len(numbers)} numbers, not 16", path, remedy)
     return np.array(numbers, dtype=np.float64).reshape(4, 4)
-
-
-def _read_intrinsics(path: Path, image_size: tuple[int, int]) -> FloatArray:
-    """(3, 3) K, checked against the size of the images it is for."""
-    remedy = "write the 4x4 or 3x3 matrix fx 0 cx, 0 fy cy, 0 0 1 in pixels"
-    if not path.is_file():
-        raise UserError("the intrinsics are missing", path, remedy)
-    numbers = _read_numbers(path, name="intrinsics", remedy=remedy)
-    if len(numbers) not in (9, 16):
-        what = f"the intrinsics have {len(numbers)} numbers, neither 16 (4x4) nor 9 (3x3)"
-        raise UserError(what, path, remedy)
-    side = 4 if len(numbers) == 16 else 3
-    matrix = np.array(numbers, dtype=np.float64).reshape(side, side)
-    if not np.isfinite(matrix).all():
-        raise UserError("the intrinsics hold numbers that are not finite", path, remedy)
-    K = matrix[:3, :3].copy()
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        what = f"the focal lengths are not positive ({K[0, 0]:g} and {K[1, 1]:g})"
-        raise UserError(what, path, remedy)
-    bottom_is_standard = np.allclose(matrix[-1], np.eye(side)[-1], rtol=0, atol=1e-6)
-    if not bottom_is_standard or not np.allclose(K[2], (0, 0, 1), rtol=0, atol=1e-6) or K[1, 0]:
-        raise UserError("the intrinsics are not a camera matrix", path, remedy)
-    if np.any(matrix[:3, 3:] != 0):
-        raise UserError("the intrinsics have a fourth column that is not 0", path, remedy)
-    _check_resolution(K, image_size, path)
-    K.setflags(write=False)
-    return K
-
-
-def _check_resolution(K: FloatArray, image_size: tuple[int, int], path: Path) -> None:
-    """The principal point is all a file tells about the resolution it was made for.
-
-    Outside the image it cannot belong to it. Inside, but away from the middle by the same part
-    on both axes, it fits an image larger or smaller by one factor; a lens shifted like that is
-    not to be expected, while intrinsics of the full resolution beside small images are.
-    """
-    height, width = image_size
-    across, down = (K[0, 2] + 0.5) / width, (K[1, 2] + 0.5) / height
-    outside = not (0 <= across <= 1 and 0 <= down <= 1)
-    low, high = SPREAD
-    scaled = not low < across < high and not low < down < high and 0.9 < across / down < 1.1
-    if outside or scaled:
-        what = (
-            f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) does not fit images of "
-            f"{width}x{height}: these intrinsics are of another resolution"
-        )
-        raise UserError(what, path, "scale fx, fy, cx and cy to the images' size")

@@ -1,0 +1,155 @@
+"""Captures that open though something in them is off: sizes, turned images, names of files."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from run_command import Run, assert_one_line
+from small_scannet import SCANNET, opened
+
+from deltas_nets.data.capture import open_capture
+from deltas_nets.data.readers.intrinsics import read_intrinsics
+from deltas_nets.errors import UserError
+
+MakeCapture = Callable[..., Path]
+
+
+def write_depth(file: Path, size: tuple[int, int]) -> None:
+    file.unlink()  # or a link would be followed
+    Image.fromarray(np.full(size, 2500, np.uint16)).save(file)
+
+
+def test_depth_of_another_size_is_refused_as_images_are(
+    run: Run, make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder = make_capture(image_size=(96, 128), depth_size=(48, 64))
+    write_depth(folder / "depth" / "2.png", (24, 32))
+    file = str(folder / "depth" / "2.png")
+    words = "depth is 32x24, the intrinsics are for 64x48"
+    assert_one_line(run("evaluate", folder, "--json", tmp_path / "s.json"), words, file)
+    (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
+    words = "depth is 32x24, the others are 64x48"
+    assert_one_line(run("evaluate", folder, "--json", tmp_path / "s.json"), words, file)
+    assert not (tmp_path / "s.json").exists()
+
+
+def test_training_refuses_depth_of_another_size(scannet_copy: Path, tmp_path: Path) -> None:
+    write_depth(scannet_copy / "scans" / "scene0000_00" / "depth" / "3.png", (48, 64))
+    for cache in (None, tmp_path / "kept", tmp_path / "kept"):
+        tuples = opened(replace(SCANNET, root=str(scannet_copy)), cache=cache)
+        with pytest.raises(UserError, match=r"depth is 64x48, the others are 128x96, .*3.png"):
+            [tuples[index] for index in range(len(tuples))]
+
+
+def test_damaged_depth_is_no_obstacle_to_what_needs_none(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    for file in (folder / "depth").iterdir():
+        file.write_bytes(b"")
+    assert open_capture(folder).frame(0).depth_size is None
+
+
+def test_turned_images_are_told_from_scaled_ones(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    for file in (folder / "color").iterdir():
+        Image.open(file).transpose(Image.Transpose.ROTATE_90).save(file)
+    with pytest.raises(UserError) as error:
+        open_capture(folder)
+    assert "images of 48x64 are rotated by 90 degrees" in str(error.value)
+    assert "is of 64x48" in str(error.value) and "intrinsic_color.txt" in str(error.value)
+
+
+@given(
+    right=st.floats(-0.07, 0.07), down=st.floats(-0.07, 0.07), ratio=st.sampled_from([4 / 3, 3 / 2])
+)
+def test_any_usual_camera_fits_its_images_and_not_those_turned(
+    right: float, down: float, ratio: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    height, width = 600, round(600 * ratio)
+    file = tmp_path_factory.getbasetemp() / "k.txt"
+    cx, cy = width * (0.5 + right) - 0.5, height * (0.5 + down) - 0.5
+    file.write_text(f"500 0 {cx} 0 500 {cy} 0 0 1")
+    assert read_intrinsics(file, (height, width))[0, 2] == cx
+    if max(abs(right), abs(down)) < 0.03:
+        with pytest.raises(UserError, match="rotated"):
+            read_intrinsics(file, (width, height))
+
+
+def warnings_of(run: Run, folder: Path, out: Path, *options: object) -> list[str]:
+    result = run("depth", folder, "--out", out, "--size", 32, 32, *options)
+    assert result.code == 0, result.err
+    return [line.removeprefix("deltas: warning: ") for line in result.err.splitlines()]
+
+
+def test_a_principal_point_far_from_the_middle_is_a_warning(
+    run: Run, make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder = make_capture()
+    file = folder / "intrinsic" / "intrinsic_color.txt"
+    file.write_text("60 0 50 0 60 24 0 0 1")
+    (said,) = warnings_of(run, folder, tmp_path / "out")
+    assert said.startswith("the principal point (50, 24) is far from the middle of images of 64x48")
+    assert str(file) in said
+    file.write_text("60 0 46 0 60 24 0 0 1")
+    assert open_capture(folder).doubts == ()
+
+
+def test_depth_of_another_shape_without_intrinsics_is_a_warning(make_capture: MakeCapture) -> None:
+    folder = make_capture(depth_size=(64, 48))
+    assert open_capture(folder).doubts == ()
+    (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
+    (said,) = open_capture(folder).doubts
+    assert said.startswith("depth of 48x64 is taken to show what images of 64x48 show")
+
+
+def test_misnamed_images_are_left_out_with_a_warning(
+    run: Run, make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder = make_capture()
+    color = folder / "color"
+    for name in ("IMG_9.jpg", "7.webp", ".8.jpg", "notes.txt", "Thumbs.db"):
+        (color / name).write_bytes(b"")
+    (said,) = warnings_of(run, folder, tmp_path / "out")
+    assert said == f"left out, {color / '7.webp'} and 1 more: images are N.jpg or N.png, N a number"
+    (color / "7.webp").unlink()
+    (said,) = warnings_of(run, folder, tmp_path / "out")
+    assert f"left out, {color / 'IMG_9.jpg'}: images" in said
+    assert "IMG_9.jpg" in run("evaluate", folder).err
+
+
+def test_training_tells_of_misnamed_images(scannet_copy: Path, tmp_path: Path) -> None:
+    color = scannet_copy / "scans" / "scene0000_00" / "color"
+    (color / "IMG_9.png").write_bytes(b"")
+    for cache in (None, tmp_path / "kept", tmp_path / "kept"):
+        said: list[str] = []
+        opened(replace(SCANNET, root=str(scannet_copy)), cache=cache, report=said.append)
+        (warning,) = [line for line in said if "warning" in line]
+        assert str(color / "IMG_9.png") in warning
+
+
+def test_more_views_than_go_together_is_a_warning(
+    run: Run, make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder, sets = make_capture(), tmp_path / "sets.json"
+    sets.write_text('[{"anchor": 0, "sources": [1, 2]}]')
+    words = ["no map is from 100 views: there are at most 3 that go together"]
+    out = tmp_path / "out"
+    assert warnings_of(run, folder, out, "--views", 100, "--view-sets", sets) == words
+    (said,) = warnings_of(run, folder, tmp_path / "chosen", "--views", 100)
+    assert said.startswith("no map is from 100 views: there are at most ")
+    assert warnings_of(run, folder, tmp_path / "few", "--views", 3, "--view-sets", sets) == []
+
+
+def test_a_cut_image_needs_no_view_sets(
+    run: Run, make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder = make_capture()
+    file = folder / "color" / "1.jpg"
+    file.write_bytes(file.read_bytes()[:-400])
+    told = run("depth", folder, "--out", tmp_path / "out")
+    assert_one_line(told, str(file), "copy the file again, or remove it")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,125 @@
+"""A summary is exact whenever a run is ended, by a signal that it hears or by another."""
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from run_command import Run
+
+from deltas_nets import predict
+from deltas_nets.outputs import OutputFolder, prepare_output
+
+SETTINGS: dict[str, Any] = {"views": 3}
+MakeCapture = Callable[..., Path]
+
+
+def write_frame(folder: OutputFolder, id: int) -> None:
+    folder.write_frame(
+        id,
+        depth=np.full((4, 6), 2.0),
+        probability=np.full((4, 6), 0.5),
+        points=np.zeros((2, 3)),
+        colors=np.zeros((2, 3), np.uint8),
+        record=record_of(id),
+    )
+
+
+def record_of(id: int) -> dict[str, Any]:
+    return {"status": "ok", "sources": [id + 1, id + 2]}
+
+
+def frames_of(out: Path) -> dict[str, Any]:
+    frames: dict[str, Any] = json.loads((out / "summary.json").read_text())["frames"]
+    return frames
+
+
+def record_files(out: Path) -> list[str]:
+    return sorted(path.name for path in out.glob("*.jsonl"))
+
+
+def test_frames_finished_after_the_last_summary_keep_their_records(tmp_path: Path) -> None:
+    killed = prepare_output(tmp_path, settings=SETTINGS)
+    write_frame(killed, 1)
+    killed.write_summary("running")
+    assert record_files(tmp_path) == []
+    for id in (2, 3):
+        write_frame(killed, id)
+    assert record_files(tmp_path) == ["summary.records.jsonl"]
+    with (tmp_path / "summary.records.jsonl").open("a") as file:
+        file.write('["4", {"stat')  # killed in the middle of a line
+    (tmp_path / "depth" / "3.png").unlink()  # killed before the last file of a frame
+    again = prepare_output(tmp_path, settings=SETTINGS)
+    assert frames_of(tmp_path) == {"1": record_of(1), "2": record_of(2)}
+    assert record_files(tmp_path) == []
+    write_frame(again, 3)
+    again.write_summary("complete")
+    assert frames_of(tmp_path) == {str(id): record_of(id) for id in (1, 2, 3)}
+    assert record_files(tmp_path) == []
+
+
+def test_records_survive_a_second_kill(tmp_path: Path) -> None:
+    write_frame(prepare_output(tmp_path, settings=SETTINGS), 1)
+    with (tmp_path / "summary.records.jsonl").open("a") as file:
+        file.write('["2", {"stat')
+    write_frame(prepare_output(tmp_path, settings=SETTINGS), 2)
+    prepare_output(tmp_path, settings=SETTINGS).write_summary("complete")
+    assert frames_of(tmp_path) == {"1": record_of(1), "2": record_of(2)}
+
+
+def test_shards_take_over_their_own_and_one_run_takes_all(tmp_path: Path) -> None:
+    for index in (1, 2):
+        shard = prepare_output(tmp_path, settings=SETTINGS, shard=(index, 2), frame_ids=[index])
+        write_frame(shard, index)
+    again = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=[1])
+    assert record_files(tmp_path) == ["summary.2-of-2.records.jsonl"]
+    again.write_summary("complete")
+    assert frames_of(tmp_path) == {"1": record_of(1)}
+    prepare_output(tmp_path, settings=SETTINGS).write_summary("complete")
+    assert frames_of(tmp_path) == {"1": record_of(1), "2": record_of(2)}
+    assert record_files(tmp_path) == []
+
+
+def test_overwriting_forgets_the_records(tmp_path: Path) -> None:
+    write_frame(prepare_output(tmp_path, settings=SETTINGS, frame_ids=[1]), 1)
+    prepare_output(tmp_path, settings={"views": 2}, overwrite=True, frame_ids=[1])
+    assert frames_of(tmp_path) == {} and record_files(tmp_path) == []
+
+
+def test_shards_of_which_none_runs_are_stopped(tmp_path: Path) -> None:
+    def status() -> str:
+        return str(json.loads((tmp_path / "summary.json").read_text())["status"])
+
+    first, second = (prepare_output(tmp_path, settings=SETTINGS, shard=(i, 2)) for i in (1, 2))
+    first.write_summary("stopped")
+    assert status() == "running"
+    second.write_summary("complete")
+    assert status() == "stopped"
+    first.write_summary("complete")
+    assert status() == "complete"
+
+
+def test_sigterm_stops_a_run_as_ctrl_c_does(
+    run: Run, make_capture: MakeCapture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished, calls = predict.predict_frame, []
+
+    def killed_at_the_third(*arguments: Any) -> predict.FrameDepth:
+        calls.append(1)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return finished(*arguments)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(predict, "predict_frame", killed_at_the_third)
+    out = tmp_path / "out"
+    stopped = run("depth", make_capture(), "--out", out, "--views", 2)
+    assert (stopped.code, stopped.err) == (130, "deltas: stopped; what is finished is kept\n")
+    assert json.loads((out / "summary.json").read_text())["status"] == "stopped"
+    assert all(len(frame["sources"]) == 1 for frame in frames_of(out).values())
+    assert len(frames_of(out)) == 2
+    assert signal.getsignal(signal.SIGTERM) is handler
