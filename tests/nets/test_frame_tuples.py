@@ -24,7 +24,17 @@ def scene_of(ids: list[int], cam_from_world: FloatArray | None = None) -> Scene:
     poses = np.tile(np.eye(4), (len(ids), 1, 1)) if cam_from_world is None else cam_from_world
     names = np.array([str(id).encode() for id in ids], dtype=np.bytes_)
     return Scene(
-        Path("nowhere"), SIZE, np.eye(3), None, np.array(ids), poses, names, names, LeftOut()
+        Path("nowhere"),
+        SIZE,
+        K=np.eye(3),
+        depth_K=None,
+        depth_size=None,
+        ids=np.array(ids),
+        cam_from_world=poses,
+        images=names,
+        depths=names,
+        left_out=LeftOut(),
+        doubts=(),
     )
 
 
