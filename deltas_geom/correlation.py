@@ -15,7 +15,7 @@ from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.pixels import normalizing, resize_pixels
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.recompute import recomputed
 from deltas_geom.sampling import Samples
 
@@ -23,7 +23,7 @@ _CACHED_ELEMENTS = 1 << 20  # a chunk should stay in the cache between writing a
 _HELD_ELEMENTS = 1 << 28  # where there is no such cache: what one call may hold in memory
 
 
-@full_precision
+@without_autocast
 def correlate(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:
@@ -79,7 +79,7 @@ def correlate(
     )
 
 
-@full_precision
+@without_autocast
 def correlate_normalized(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:

@@ -6,7 +6,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 from deltas_geom.views import PosedViews
 
 
@@ -31,7 +31,7 @@ def inverse_intrinsics(K: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(K.shape)
 
 
-@full_precision
+@without_autocast
 def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> Tensor:
     """Fundamental matrix F with x_source^T F x_anchor = 0 for pixels of one point.
 
@@ -55,7 +55,7 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
     return inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
 
 
-@full_precision
+@without_autocast
 def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     r"""Lines of the second view on which the first view's pixels must lie.
 
@@ -90,7 +90,7 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     return lines * torch.where(has_line, squared, 1.0).rsqrt()
 
 
-@full_precision
+@without_autocast
 def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Signed distance of the second view's pixels from the first view's epipolar lines.
 

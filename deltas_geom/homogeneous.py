@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 
 
-@full_precision
+@without_autocast
 def to_homogeneous(coordinates: Tensor) -> Tensor:
     """Append a one: ``(*B, D)`` to ``(*B, D + 1)``.
 
@@ -29,7 +29,7 @@ def safe_divide(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor
     return torch.where(where, numerator / torch.where(where, denominator, 1.0), 0.0)
 
 
-@full_precision
+@without_autocast
 def from_homogeneous(coordinates: Tensor) -> Tensor:
     """Divide by the last coordinate: ``(*B, D + 1)`` to ``(*B, D)``.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.sampling import Samples, sample_inv_depths
 from deltas_geom.views import PosedViews
 
@@ -55,7 +55,7 @@ class SoftArgmax(NamedTuple):
     entropy: Tensor
 
 
-@full_precision
+@without_autocast
 def soft_argmax(
     logits: Tensor, positions: Tensor, *, mask: Tensor | None = None, window: int | None = None
 ) -> SoftArgmax:
@@ -130,7 +130,7 @@ def matches_from_sources(
     )
 
 
-@full_precision
+@without_autocast
 def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor:
     """Weights in 1/px from the covariance of matches, as triangulation's covariance reads them.
 
@@ -166,7 +166,7 @@ def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor
     return torch.where(known, torch.where(known, variance, 1.0).rsqrt(), 0.0)
 
 
-@full_precision
+@without_autocast
 def match_per_view(
     keypoints: Tensor, scores: Tensor, samples: Samples, *, window: int | None = None
 ) -> Matches:
@@ -198,7 +198,7 @@ def match_per_view(
     )
 
 
-@full_precision
+@without_autocast
 def match_joint(
     views: PosedViews,
     keypoints: Tensor,

@@ -15,7 +15,7 @@ from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
 from deltas_geom.poses import camera_centers
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.status import Status
 from deltas_geom.triangulation import Triangulation
 from deltas_geom.uncertainty import parallax_of
@@ -24,7 +24,7 @@ _Vector = tuple[Tensor, ...]
 """Three components, each of any shape."""
 
 
-@full_precision
+@without_autocast
 def triangulate_midpoint(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
 ) -> Triangulation:
@@ -62,7 +62,7 @@ def triangulate_midpoint(
     return _triangulate(cam_from_world, rays, weights, mask, stepped=False)
 
 
-@full_precision
+@without_autocast
 def triangulate_inverse_depth_weighted(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
 ) -> Triangulation:

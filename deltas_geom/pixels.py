@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_image_size, check_shapes
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 
 
 def pixel_grid(
@@ -34,7 +34,7 @@ def pixel_grid(
     return torch.stack([x, y], dim=-1).reshape(-1, 2)
 
 
-@full_precision
+@without_autocast
 def in_image(pixels: Tensor, *, image_size: tuple[int, int], border: float = 0.0) -> Tensor:
     """Whether pixels ``(*B, 2)`` lie in the image, at least ``border`` px from its edge.
 
@@ -47,7 +47,7 @@ def in_image(pixels: Tensor, *, image_size: tuple[int, int], border: float = 0.0
     return (x >= low) & (x <= width - 1 - low) & (y >= low) & (y <= height - 1 - low)
 
 
-@full_precision
+@without_autocast
 def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     """Pixels ``(*B, 2)`` as `grid_sample` coordinates (``align_corners=False``).
 
@@ -72,7 +72,7 @@ def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, T
     return at_zero, slope
 
 
-@full_precision
+@without_autocast
 def resize_pixels(
     pixels: Tensor, *, old_size: tuple[int, int], new_size: tuple[int, int]
 ) -> Tensor:
@@ -88,7 +88,7 @@ def resize_pixels(
     return scale * (pixels + 0.5) - 0.5
 
 
-@full_precision
+@without_autocast
 def resize_intrinsics(K: Tensor, *, old_size: tuple[int, int], new_size: tuple[int, int]) -> Tensor:
     """Intrinsics ``(*B, 3, 3)`` of the resized image; each axis has its own scale.
 
@@ -105,7 +105,7 @@ def resize_intrinsics(K: Tensor, *, old_size: tuple[int, int], new_size: tuple[i
     return torch.stack([sx * x + (sx - 1) / 2 * last, sy * y + (sy - 1) / 2 * last, last], dim=-2)
 
 
-@full_precision
+@without_autocast
 def crop_intrinsics(K: Tensor, *, left: float, top: float) -> Tensor:
     """Intrinsics ``(*B, 3, 3)`` of the image whose pixel (0, 0) was (left, top)."""
     check_shapes(K=(K, "3 3"))

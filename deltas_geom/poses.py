@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_shapes
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 
 
-@full_precision
+@without_autocast
 def invert_pose(b_from_a: Tensor) -> Tensor:
     """``a_from_b`` of rigid transforms ``(*B, 4, 4)``: transpose, no matrix inverse.
 
@@ -23,14 +23,14 @@ def invert_pose(b_from_a: Tensor) -> Tensor:
     return torch.cat([torch.cat([rotation, translation], dim=-1), b_from_a[..., 3:, :]], dim=-2)
 
 
-@full_precision
+@without_autocast
 def relative_pose(b_from_world: Tensor, a_from_world: Tensor) -> Tensor:
     """``b_from_a`` ``(*B, 4, 4)`` of two cameras posed in one world; ``*B`` broadcasts."""
     b_from_world, a_from_world = promoted(b_from_world, a_from_world)
     return b_from_world @ invert_pose(a_from_world)
 
 
-@full_precision
+@without_autocast
 def camera_centers(cam_from_world: Tensor) -> Tensor:
     """World positions ``(*B, 3)`` of cameras ``(*B, 4, 4)``, metres."""
     check_shapes(cam_from_world=(cam_from_world, "4 4"))
@@ -38,7 +38,7 @@ def camera_centers(cam_from_world: Tensor) -> Tensor:
     return -(rotation.mT @ translation).squeeze(-1)
 
 
-@full_precision
+@without_autocast
 def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:
     """Whether ``(*B, 4, 4)`` are finite rotations with a translation, ``(*B)`` bool.
 

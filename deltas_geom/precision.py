@@ -17,7 +17,7 @@ def promoted(*tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(tensor.to(dtype) for tensor in tensors)
 
 
-def full_precision(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+def without_autocast(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Keep ``torch.autocast`` out of an operation: it computes in the dtypes of its arguments.
 
     Autocast multiplies matrices in half precision. In bfloat16 a pixel at 600 is known to 4 px, and
@@ -25,7 +25,7 @@ def full_precision(operation: Callable[_Arguments, _Result]) -> Callable[_Argume
     """
 
     @wraps(operation)
-    def outside_autocast(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         device = _device_type((*args, *kwargs.values()))
         # Asked first: an exported program that holds a region without autocast cannot be loaded.
         if device is None or not torch.is_autocast_enabled(device):
@@ -33,7 +33,7 @@ def full_precision(operation: Callable[_Arguments, _Result]) -> Callable[_Argume
         with torch.autocast(device, enabled=False):
             return operation(*args, **kwargs)
 
-    return outside_autocast
+    return called
 
 
 def _device_type(values: Iterable[object]) -> str | None:

@@ -8,7 +8,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import invert_pose
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 from deltas_geom.views import PosedViews
 
 
@@ -28,7 +28,7 @@ class Projection(NamedTuple):
     in_front: Tensor
 
 
-@full_precision
+@without_autocast
 def project(views: PosedViews, points: Tensor) -> Projection:
     """Project world points into every view.
 
@@ -63,7 +63,7 @@ def project(views: PosedViews, points: Tensor) -> Projection:
     return Projection(pixels, depth, in_front)
 
 
-@full_precision
+@without_autocast
 def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
     """World points seen at pixels of each view, at a depth along its z axis.
 
@@ -85,7 +85,7 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
     return to_homogeneous(rays * depth[..., None]) @ world_from_cam[..., :3, :].mT
 
 
-@full_precision
+@without_autocast
 def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
     """Rays through pixels in the camera's own frame, scaled to depth 1.
 

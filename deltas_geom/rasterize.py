@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_geom.checks import check_bool, check_image_size, check_shapes
 from deltas_geom.homogeneous import safe_divide
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 
 
 class SparseDepth(NamedTuple):
@@ -22,7 +22,7 @@ class SparseDepth(NamedTuple):
     weight: Tensor
 
 
-@full_precision
+@without_autocast
 def rasterize_depth(
     pixels: Tensor,
     depth: Tensor,

@@ -23,7 +23,7 @@ from deltas_geom.observations import (
     weigh,
 )
 from deltas_geom.poses import camera_centers
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.rig_frame import (
     FoundPoints,
     RigFrame,
@@ -39,7 +39,7 @@ from deltas_geom.triangulation import Triangulation
 from deltas_geom.uncertainty import parallax_of
 
 
-@full_precision
+@without_autocast
 def triangulate_rays(
     cam_from_world: Tensor,
     rays: Tensor,

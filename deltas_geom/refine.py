@@ -15,7 +15,7 @@ from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.normal_matrix import Symmetric3, normal_matrix, second_derivative, solve3_scaled
 from deltas_geom.observations import Observations, Vector3, check_weights, observe, over_views
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 
 Loss = Literal["squared", "huber", "cauchy"]
 
@@ -41,7 +41,7 @@ class Refined(NamedTuple):
     valid: Tensor
 
 
-@full_precision
+@without_autocast
 def refine_points(
     proj: Tensor,
     pixels: Tensor,

@@ -11,7 +11,7 @@ from torch import Tensor
 from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import to_homogeneous
 from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.status import Status
 from deltas_geom.triangulation import triangulate, triangulate_points
 
@@ -42,7 +42,7 @@ class RobustTriangulation(NamedTuple):
     inliers: Tensor
 
 
-@full_precision
+@without_autocast
 def triangulate_robust(
     proj: Tensor,
     pixels: Tensor,

@@ -10,7 +10,7 @@ from torch import Tensor
 from deltas_geom.checks import batch_shape, check_image_size, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.pixels import in_image, normalize_pixels
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.segments import Segments, epipolar_rays
 from deltas_geom.views import PosedViews
 
@@ -29,7 +29,7 @@ class Samples(NamedTuple):
     mask: Tensor
 
 
-@full_precision
+@without_autocast
 def sample_segments(
     segments: Segments,
     num_samples: int,
@@ -86,7 +86,7 @@ def sample_segments(
     return Samples(pixels, inv_depth, mask)
 
 
-@full_precision
+@without_autocast
 def sample_inv_depths(
     views: PosedViews, pixels: Tensor, inv_depths: Tensor, *, image_size: tuple[int, int]
 ) -> Samples:
@@ -118,7 +118,7 @@ def sample_inv_depths(
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
 
 
-@full_precision
+@without_autocast
 def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     """Read a feature map of any stride at pixels of the image, bilinearly.
 

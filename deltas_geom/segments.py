@@ -14,7 +14,7 @@ from deltas_geom.checks import check_depth_range, check_image_size, check_shapes
 from deltas_geom.fundamental import inverse_intrinsics
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 from deltas_geom.projection import pixel_rays
 from deltas_geom.status import Status
 from deltas_geom.views import PosedViews
@@ -125,7 +125,7 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     )
 
 
-@full_precision
+@without_autocast
 def epipolar_segments(
     views: PosedViews,
     pixels: Tensor,

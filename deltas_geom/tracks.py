@@ -13,7 +13,7 @@ from deltas_geom.checks import ShapeError, check_index, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Vector3
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.recompute import recomputed
 from deltas_geom.rig_frame import (
     FoundPoints,
@@ -46,7 +46,7 @@ class TriangulatedTracks(NamedTuple):
     residual: Tensor
 
 
-@full_precision
+@without_autocast
 def triangulate_tracks(
     proj: Tensor,
     pixels: Tensor,

@@ -22,7 +22,7 @@ from deltas_geom.equations import (
 )
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Cameras, Observations, Vector3
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.recompute import WithLagrangian
 from deltas_geom.rig_frame import (
     FoundPoints,
@@ -67,7 +67,7 @@ class Triangulation(NamedTuple):
     covariance: Tensor | None
 
 
-@full_precision
+@without_autocast
 def triangulate_points(
     proj: Tensor,
     pixels: Tensor,
@@ -111,7 +111,7 @@ def triangulate_points(
     return in_chunks(function, values, proj, points, dims=(-2, -1, -1), prepare=prepare)[0]
 
 
-@full_precision
+@without_autocast
 def triangulate(
     proj: Tensor,
     pixels: Tensor,

@@ -14,7 +14,7 @@ from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.fundamental import cross_matrix
 from deltas_geom.observations import solver_dtype
-from deltas_geom.precision import full_precision
+from deltas_geom.precision import without_autocast
 from deltas_geom.status import Status
 
 
@@ -41,7 +41,7 @@ class TwoViewTriangulation(NamedTuple):
     parallax: Tensor
 
 
-@full_precision
+@without_autocast
 def triangulate_two_view(
     proj: Tensor, pixels: Tensor, mask: Tensor | None = None
 ) -> TwoViewTriangulation:

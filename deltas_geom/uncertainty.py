@@ -9,10 +9,10 @@ from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.normal_matrix import Symmetric3, inverse3, normal_matrix
 from deltas_geom.observations import Vector3, projection_centers, solver_dtype
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 
 
-@full_precision
+@without_autocast
 def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
     """Weighted RMS distance of projections from pixels, ``(*B, N)`` px.
 
@@ -37,7 +37,7 @@ def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights:
     return residual_of(seen, pixels.to(work).mT, share * share).to(proj.dtype)
 
 
-@full_precision
+@without_autocast
 def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     """Largest angle between the rays of used views at a point, ``(*B, N)`` rad.
 
@@ -54,7 +54,7 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     return parallax_of(centers, (x, y, z), used.to(work)).to(proj.dtype)
 
 
-@full_precision
+@without_autocast
 def point_covariance(
     proj: Tensor, points: Tensor, weights: Tensor, *, pose_covariance: Tensor | None = None
 ) -> Tensor:
@@ -100,7 +100,7 @@ def point_covariance(
     return found.to(proj.dtype).nan_to_num(limit).clamp(-limit, limit)
 
 
-@full_precision
+@without_autocast
 def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
     """Variance ``(*B, V, N)`` m^2 of points' depths in views, from the points' covariance.
 

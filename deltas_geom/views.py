@@ -9,7 +9,7 @@ from torch import Tensor
 from deltas_geom.checks import ShapeError, check_shapes
 from deltas_geom.pixels import crop_intrinsics, resize_intrinsics
 from deltas_geom.poses import invert_pose, is_rigid
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 
 
 class PosedViews(NamedTuple):
@@ -32,7 +32,7 @@ class PosedViews(NamedTuple):
     cam_from_world: Tensor
 
     @property
-    @full_precision
+    @without_autocast
     def proj(self) -> Tensor:
         """Projection matrices K [R | t], ``(*B, V, 3, 4)``, in the dtype to which both promote."""
         check_shapes(K=(self.K, "V 3 3"), cam_from_world=(self.cam_from_world, "V 4 4"))

@@ -4,6 +4,7 @@ Each image of a batch gets strengths of its own. Depth and cameras stay as they 
 """
 
 import math
+from abc import abstractmethod
 from typing import Any
 
 import torch
@@ -87,6 +88,21 @@ class _CameraEffect(IntensityAugmentationBase2D):  # type: ignore[misc]
             name: undrawn.clone().uniform_(low, high) for name, (low, high) in self.flags.items()
         }
 
+    def apply_transform(
+        self,
+        images: Tensor,
+        params: dict[str, Tensor],
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+    ) -> Tensor:
+        """Images ``(B, C, H, W)`` in [0, 1]."""
+        drawn = {name: params[name].to(images) for name in self.flags}
+        return self._changed(images, drawn).clamp(0, 1)
+
+    @abstractmethod
+    def _changed(self, images: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        """The images by strengths ``(B,)``, by name; what leaves [0, 1] is cut off."""
+
 
 class RandomVignetting(_CameraEffect):
     """Darken images towards their corners: see :func:`vignetting_gain`.
@@ -99,16 +115,9 @@ class RandomVignetting(_CameraEffect):
     def __init__(self, corner: Range = (0.55, 1.0), p: float = 0.5) -> None:
         super().__init__(p, corner=corner)
 
-    def apply_transform(
-        self,
-        images: Tensor,
-        params: dict[str, Tensor],
-        flags: dict[str, Any],
-        transform: Tensor | None = None,
-    ) -> Tensor:
-        """Images ``(B, C, H, W)`` in [0, 1]."""
+    def _changed(self, images: Tensor, drawn: dict[str, Tensor]) -> Tensor:
         size = (images.shape[-2], images.shape[-1])
-        return (images * vignetting_gain(params["corner"].to(images), image_size=size)).clamp(0, 1)
+        return images * vignetting_gain(drawn["corner"], image_size=size)
 
 
 class RandomRollingExposure(_CameraEffect):
@@ -127,19 +136,12 @@ class RandomRollingExposure(_CameraEffect):
     ) -> None:
         super().__init__(p, amplitude=amplitude, periods=periods, phase=(0, 1), axis=(0, 1))
 
-    def apply_transform(
-        self,
-        images: Tensor,
-        params: dict[str, Tensor],
-        flags: dict[str, Any],
-        transform: Tensor | None = None,
-    ) -> Tensor:
-        """Images ``(B, C, H, W)`` in [0, 1]."""
-        wave = [params[name].to(images) for name in ("amplitude", "periods", "phase")]
+    def _changed(self, images: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        wave = drawn["amplitude"], drawn["periods"], drawn["phase"]
         rows = exposure_wave(*wave, length=images.shape[-2])[:, None, :, None]
         columns = exposure_wave(*wave, length=images.shape[-1])[:, None, None, :]
-        by_row = params["axis"].to(images).view(-1, 1, 1, 1) < 0.5
-        return (images * torch.where(by_row, rows, columns)).clamp(0, 1)
+        by_row = drawn["axis"].view(-1, 1, 1, 1) < 0.5
+        return images * torch.where(by_row, rows, columns)
 
 
 class RandomCornerBlur(_CameraEffect):
@@ -153,15 +155,8 @@ class RandomCornerBlur(_CameraEffect):
     def __init__(self, strength: Range = (0.3, 1.0), p: float = 0.5) -> None:
         super().__init__(p, strength=strength)
 
-    def apply_transform(
-        self,
-        images: Tensor,
-        params: dict[str, Tensor],
-        flags: dict[str, Any],
-        transform: Tensor | None = None,
-    ) -> Tensor:
-        """Images ``(B, C, H, W)`` in [0, 1]."""
-        return blur_corners(images, params["strength"].to(images)).clamp(0, 1)
+    def _changed(self, images: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+        return blur_corners(images, drawn["strength"])
 
 
 def _squared_radius(image_size: tuple[int, int], like: Tensor) -> Tensor:

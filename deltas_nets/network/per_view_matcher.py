@@ -17,6 +17,7 @@ from deltas_geom import (
     sample_map,
     sample_segments,
 )
+from deltas_geom.precision import promoted, without_autocast
 from deltas_geom.recompute import recomputed
 from deltas_nets.config import MatcherConfig
 from deltas_nets.network.descriptor import Descriptors
@@ -67,6 +68,7 @@ class PerViewMatcher(nn.Module):
         return Matched(matches, confidence, posterior, None)
 
 
+@without_autocast
 def read_and_multiply(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:
@@ -117,9 +119,6 @@ def _dot_products(
     image_size: tuple[int, int],
 ) -> Tensor:
     """Of descriptors ``(B, N, D)`` and features ``(B, D, h, w)`` at ``(B, N, O, S, 2)``."""
-    with torch.autocast(features.device.type, enabled=False):
-        read = sample_map(features, pixels.flatten(1, 3), image_size=image_size)
-        dtype = torch.promote_types(read.dtype, descriptors.dtype)
-        read = read.to(dtype).reshape(*mask.shape, read.shape[-1])
-        products = torch.einsum("bnd,bnosd->bnos", descriptors.to(dtype), read)
-    return torch.where(mask, products, 0.0)
+    read = sample_map(features, pixels.flatten(1, 3), image_size=image_size)
+    descriptors, read = promoted(descriptors, read.reshape(*mask.shape, read.shape[-1]))
+    return torch.where(mask, torch.einsum("bnd,bnosd->bnos", descriptors, read), 0.0)

@@ -21,6 +21,8 @@ import torch.nn.functional as F
 import tyro
 from torch import Tensor
 
+from deltas_nets.atomic_files import check_writable
+from deltas_nets.config.checks import check_at_least, check_positive, check_seed
 from deltas_nets.data.augment import Photometry
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.data.synthetic.textures import GROUNDS, PICTURES, load_picture
@@ -80,11 +82,10 @@ class DistillConfig:
     """Of everything random."""
 
     def __post_init__(self) -> None:
-        least = min(self.steps, self.batch_size, self.num_images, self.looks, self.adaptation)
-        if least < 1:
-            raise ValueError(
-                "steps, batch_size, num_images, looks and adaptation must be at least 1"
-            )
+        check_at_least(1, self, "steps", "batch_size", "num_images", "looks", "adaptation")
+        check_at_least(0, self, "fine_width", "threshold")
+        check_positive(self, "learning_rate", "gain")
+        check_seed(self)
         if not 0 <= self.picture_share <= 1:
             raise ValueError(f"picture_share must be within [0, 1], got {self.picture_share}")
 
@@ -114,6 +115,9 @@ def distill(config: DistillConfig, *, report: Callable[[str], None] = print) -> 
     Raises:
         UserError: a file is missing or holds something else, or cannot be written.
     """
+    if config.out.suffix != ".safetensors":
+        raise UserError("weights are .safetensors", config.out, "name such a file with --out")
+    check_writable(config.out.parent)
     teacher = load_teacher(config.teacher, config.teacher_weights)
     source = weights_file(config.init)
     model = load_model(config.init)

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from torch.utils._pytree import tree_leaves, tree_map
 
 import deltas_geom as geom
-from deltas_geom.precision import full_precision, promoted
+from deltas_geom.precision import promoted, without_autocast
 
 ALL = OPERATIONS | METHODS
 
@@ -122,7 +122,7 @@ def test_without_autocast_a_graph_holds_no_region_of_it() -> None:
 
 
 def test_what_has_no_tensor_or_no_autocast_is_left_to_the_operation() -> None:
-    @full_precision
+    @without_autocast
     def kind(value: object, *, other: object = None) -> str:
         return type(value).__name__
 
