@@ -9,7 +9,7 @@ class Status(IntEnum):
     OK: valid. TOO_FEW_VIEWS: fewer than two views count. NO_PARALLAX: depth cannot be seen from
     where the cameras stand. AT_INFINITY: the rays are parallel. BEHIND_CAMERA: they meet behind a
     used camera. NOT_FINITE_INPUT: something used is NaN or infinite. EMPTY: nothing of the depth
-    range is visible (segments).
+    range is visible (segments). OUT_OF_RANGE: the depth is not within the range asked for.
 
     Example:
         >>> print(Status.BEHIND_CAMERA.explanation)
@@ -23,6 +23,7 @@ class Status(IntEnum):
     BEHIND_CAMERA = 4
     NOT_FINITE_INPUT = 5
     EMPTY = 6
+    OUT_OF_RANGE = 7
 
     @property
     def explanation(self) -> str:
@@ -51,5 +52,8 @@ _EXPLANATIONS = {
     ),
     Status.EMPTY: (
         "no depth of the range is visible in this source: widen the range or choose another view"
+    ),
+    Status.OUT_OF_RANGE: (
+        "the rays meet nearer or farther than the depth range: a match is wrong, or widen the range"
     ),
 }

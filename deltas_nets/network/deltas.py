@@ -207,13 +207,13 @@ class Deltas(nn.Module):
             points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
             if self.judge is not None and matched.decision is not None:
                 confidence = self.judge(matched.decision, matches, posterior, points, views)
-            depth = points.depth[:, 0]
-            near, far = 0.5 * depth_range[0], 2 * depth_range[1]
+            # A point may leave the range that was searched, as matches move afterwards; not by far.
+            points = points.within_depth((0.5 * depth_range[0], 2 * depth_range[1]))
             sparse = rasterize_depth(
                 keypoints.pixels,
-                depth,
+                points.depth[:, 0],
                 image_size=image_size,
-                mask=points.valid & (depth > near) & (depth < far),
+                mask=points.valid,
                 weights=confidence,
                 reduce="mean",
             )
