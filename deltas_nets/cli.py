@@ -16,9 +16,11 @@ import tyro
 
 from deltas_nets import __version__
 from deltas_nets.cli_calibrate import Calibrate
+from deltas_nets.cli_distill import Distill
 from deltas_nets.cli_evaluate import Evaluate
 from deltas_nets.cli_export import Export
 from deltas_nets.cli_prediction import Prediction
+from deltas_nets.cli_recipe import MakeWeights
 from deltas_nets.cli_training import Cost, Flag, Train, preset_of
 from deltas_nets.config import TRAIN_CONFIGS, to_dict
 from deltas_nets.errors import UserError
@@ -105,7 +107,7 @@ class Depth(Prediction):
         capture = open_capture(self.capture)
         view_sets = usable_view_sets(capture, self.view_sets, self.views)
         check_all(capture, view_sets)
-        warn_of(capture, self.view_sets)
+        warn_of(capture, view_sets, self.view_sets, self.depth_range)
         network = self.network()
         check_asked(network, config, capture, view_sets)
         mine = view_sets[shard[0] - 1 :: shard[1]]
@@ -157,7 +159,7 @@ def main() -> None:
         sys.exit(130)
 
 
-Command = Demo | Depth | Evaluate | Train | Calibrate | Export | Cost
+Command = Demo | Depth | Evaluate | Train | MakeWeights | Distill | Calibrate | Export | Cost
 
 
 def _parse(arguments: list[str]) -> Command:
@@ -166,10 +168,11 @@ def _parse(arguments: list[str]) -> Command:
     preset = preset_of(arguments)
     default = Train(out=Path("runs") / preset, preset=preset, config=TRAIN_CONFIGS[preset])
     train = Annotated[Train, tyro.conf.subcommand(name="train", default=default)]
+    recipe = Annotated[MakeWeights, tyro.conf.subcommand(name="recipe")]
     try:
         with contextlib.redirect_stderr(said):
             command: Command = tyro.cli(
-                Demo | Depth | Evaluate | train | Calibrate | Export | Cost,
+                Demo | Depth | Evaluate | train | recipe | Distill | Calibrate | Export | Cost,
                 prog="deltas",
                 description="Metric depth from posed images.",
                 args=arguments,
@@ -193,12 +196,22 @@ def _in_words(box: str) -> str:
     plain = re.sub(r"\[/?bold\]|│", " ", " ".join(inside))
     parts = [" ".join(part.split()) for part in re.split("─{3,}", plain)]
     said = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
-    # What a config inside the config refused comes with tyro's name for where it is.
-    return re.sub(r"^Error parsing __tyro\S+ ", "", said)
+    # What a config, or one inside it, refused comes with tyro's or Python's name for where it is.
+    return re.sub(r"^Error parsing (__tyro\S+|[A-Z]\w+:) ", "", said)
 
 
 def _help_of(arguments: list[str]) -> str:
-    commands = ("demo", "depth", "evaluate", "train", "calibrate", "export", "cost")
+    commands = (
+        "demo",
+        "depth",
+        "evaluate",
+        "train",
+        "recipe",
+        "distill",
+        "calibrate",
+        "export",
+        "cost",
+    )
     known = [word for word in arguments[:1] if word in commands]
     return " ".join(["see deltas", *known, "--help"])
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from run_command import Run, assert_one_line, runner
+from run_command import Run, assert_one_line
 
 from deltas_nets import cli
 from deltas_nets.cli_training import Train
@@ -20,12 +20,6 @@ from deltas_nets.outputs import read_depth_png, read_points_ply
 from deltas_nets.pretrained import save_weights
 
 MakeCapture = Callable[..., Path]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """Run `deltas` with arguments, in this process."""
-    return runner(monkeypatch, capfd)
 
 
 @pytest.fixture(scope="session")
@@ -358,7 +352,7 @@ def test_train_resume_and_refusal(run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("command", ["demo", "depth", "evaluate", "train"])
+@pytest.mark.parametrize("command", ["demo", "depth", "evaluate", "train", "distill"])
 def test_every_command_explains_itself_with_an_example(run: Run, command: str) -> None:
     result = run(command, "--help")
     assert result.code == 0

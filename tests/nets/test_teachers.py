@@ -406,7 +406,7 @@ def test_distillation_changes_the_detector_alone_and_is_repeatable(tmp_path: Pat
             picture_share=1.0,
             gain=10.0,
         )
-        assert distill(config, report=lambda _: None) == out
+        assert distill(config) == out
         return load_file(out)
 
     before = load_file(weights_file("deltas-small"))

@@ -1,0 +1,39 @@
+"""The command `deltas distill`: interest points that a published detector finds."""
+
+from dataclasses import dataclass
+
+from deltas_nets.cli_training import Flag
+from deltas_nets.config.distill import DistillConfig
+
+
+@dataclass(frozen=True)
+class Distill(DistillConfig):
+    """Teach the detector of weights to find a published detector's points.
+
+    Nothing else of the network changes. The teacher looks at every picture of a pool from several
+    sides and keeps what it finds from most; the student learns to find that in other light. The
+    weights say whose points they know, with the licence of the teacher's own. Calibrate them
+    afterwards: other points have other errors.
+
+    Example: deltas distill --teacher aliked --teacher-weights aliked-n16.pth --out mine.safetensors
+    """
+
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, mps."""
+    overwrite: Flag = False
+    """Replace --out if it exists."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Do it."""
+        from deltas_nets.checked_inputs import usable_device
+        from deltas_nets.pretrained import read_metadata
+        from deltas_nets.terminal import progress
+        from deltas_nets.train.distill import distill
+
+        device = usable_device(self.device)
+        with progress("distill", self.num_images + self.steps) as report:
+            distill(self, device=device, overwrite=self.overwrite, report=report)
+        loss = read_metadata(self.out)["detector_loss"]
+        print(f"weights in {self.out}, loss {loss} at the end")

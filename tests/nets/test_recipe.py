@@ -1,0 +1,178 @@
+"""`deltas recipe`: parts one after the other, each from the weights of the one before."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from run_command import Run, assert_one_line, runner
+from run_fit import CONFIG as CONFIG_OF_FOUR
+from run_fit import logged
+from torch import Tensor
+
+from deltas_nets.config import to_dict
+from deltas_nets.config.recipes import FEWEST_ROOMS, RECIPES, Part, Recipe
+from deltas_nets.data.synthetic import Rooms
+from deltas_nets.errors import UserError
+from deltas_nets.pretrained import load_model, read_metadata
+from deltas_nets.train import fit as fit_module
+from deltas_nets.train import recipe as recipe_module
+from deltas_nets.train.checkpoint import load_config
+from deltas_nets.train.recipe import run_parts
+from deltas_nets.train.start import Start
+
+CONFIG = replace(CONFIG_OF_FOUR, batch_size=2)
+SMALL = Recipe(
+    (
+        Part("1-first", replace(CONFIG, steps=1)),
+        Part("2-second", replace(CONFIG, steps=2, seed=1, learning_rate=1e-9)),
+    ),
+    calibration_rooms=FEWEST_ROOMS,
+)
+FIRST, SECOND = (part.name for part in SMALL.parts)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_validation() -> Iterator[None]:
+    few = Rooms(1, num_views=2, image_size=(48, 64))
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(fit_module, "validation_rooms", lambda: few)
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the recipe was run without a break."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert run_parts(SMALL, folder, report=silently) == folder / SECOND / "weights.safetensors"
+    return folder
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+    monkeypatch.setitem(RECIPES, "night", SMALL)
+    return runner(monkeypatch, capfd)
+
+
+def silently(message: str) -> None:
+    pass
+
+
+def weights_of(folder: Path, part: str) -> dict[str, Tensor]:
+    return load_model(folder / part / "weights.safetensors").state_dict()
+
+
+def test_a_part_starts_from_the_weights_of_the_one_before(whole: Path) -> None:
+    before, after = weights_of(whole, FIRST), weights_of(whole, SECOND)
+    moved = max(
+        float((after[name] - before[name]).abs().max())
+        for name in after
+        if name.endswith("weight") and "running" not in name
+    )
+    assert 0 < moved < 1e-6, "the second part, whose rate is next to nothing, began elsewhere"
+    for part in SMALL.parts:
+        assert load_config(whole / part.name) == part.config
+        assert logged(whole / part.name)[-1]["step"] == part.config.steps
+
+
+def test_a_recipe_that_was_stopped_gives_the_same_weights(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = recipe_module.fit
+
+    def stopped(config, folder, start, **more):  # type: ignore[no-untyped-def]
+        original(config, folder, start, stop=1 if folder.name == SECOND else None, **more)
+        if folder.name == SECOND:
+            raise KeyboardInterrupt
+        return folder / "weights.safetensors"
+
+    monkeypatch.setattr(recipe_module, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_parts(SMALL, tmp_path, report=silently)
+    monkeypatch.setattr(recipe_module, "fit", original)
+    run_parts(SMALL, tmp_path, report=silently)
+    for part in (FIRST, SECOND):
+        now, wanted = weights_of(tmp_path, part), weights_of(whole, part)
+        assert all(torch.equal(now[name], wanted[name]) for name in wanted)
+
+
+def test_another_recipe_in_the_folder_is_refused_before_anything_is_trained(
+    whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = SMALL._replace(
+        parts=(SMALL.parts[0], SMALL.parts[1]._replace(config=replace(CONFIG, steps=7)))
+    )
+    monkeypatch.setattr(recipe_module, "fit", lambda *_, **__: pytest.fail("it trained"))
+    with pytest.raises(UserError, match="steps 2, not 7"):
+        run_parts(other, whole, report=silently)
+
+
+def test_the_command_trains_and_calibrates(tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "run"
+    result = run("recipe", "night", "--out", out, "--workers", 0)
+    assert result.code == 0, result.err
+    assert "part 1 of 2: 1-first, 1 steps" in result.out
+    record = read_metadata(out / "weights.safetensors")
+    assert record["step"] == "2" and record["seed"] == "1"
+    assert "EfficientNet-Lite0" in record["origin"] and "rooms" in record["calibration"]
+    said = torch.tensor([-3.0])
+    assert not torch.equal(load_model(out / "weights.safetensors").calibration(said, 3), said)
+    assert_one_line(run("recipe", "night", "--out", out, "--workers", 0), "finished", "weights")
+
+
+def test_the_command_goes_on_from_weights(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts: list[Start] = []
+
+    def spied(config, folder, start, **_):  # type: ignore[no-untyped-def]
+        starts.append(start)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recipe_module, "fit", spied)
+    given = tmp_path / "given.safetensors"
+    assert run("recipe", "night", "--out", tmp_path / "run", "--init", given).code == 130
+    assert starts == [Start(init=given)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--effort", "0"], "--effort"),
+        (["--effort", "-1"], "--effort"),
+        (["--workers", "-1"], "--workers"),
+        (["--teacher-weights", "missing.pth"], "missing.pth"),
+        (["--init", "missing.safetensors"], "missing.safetensors"),
+    ],
+)
+def test_nonsense_is_refused_before_anything_is_written(
+    tmp_path: Path, run: Run, arguments: list[str], said: str
+) -> None:
+    out = tmp_path / "run"
+    assert_one_line(run("recipe", "night", "--out", out, "--workers", 0, *arguments), said)
+    assert not out.exists() or not any(out.iterdir())
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_scaled_taught_and_with_workers_change_nothing_else(name: str) -> None:
+    recipe = RECIPES[name]  # type: ignore[index]
+    changed = recipe.scaled(0.01).taught_by("aliked").with_workers(0)
+    assert FEWEST_ROOMS <= changed.calibration_rooms < recipe.calibration_rooms
+    for before, after in zip(recipe.parts, changed.parts, strict=True):
+        assert 1 <= after.config.steps < before.config.steps
+        wanted = to_dict(before.config)
+        wanted |= {"steps": after.config.steps, "teacher": "aliked"}
+        wanted["data"] |= {"workers": 0}
+        assert to_dict(after.config) == wanted
+
+
+def test_no_recipe_trains_on_rooms_that_are_held_out_or_on_a_part_s_rooms_again() -> None:
+    for recipe in RECIPES.values():
+        used = [
+            range(part.config.data.seed, part.config.data.seed + part.config.data.num_rooms)
+            for part in recipe.parts
+        ]
+        assert all(rooms.start >= 1000 for rooms in used)  # the seeds below are held out
+        assert all(a.stop <= b.start for a, b in pairwise(used))
