@@ -1,6 +1,7 @@
 """What commands are given, checked before anything is computed or written."""
 
 import re
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 
 from deltas_nets.data.capture import Capture, ids_in_words
 from deltas_nets.data.view_choice import choose_view_sets
-from deltas_nets.data.view_sets import ViewSet, check_frames, read_view_sets
+from deltas_nets.data.view_sets import ViewSet, check_frames, doubtful_scale, read_view_sets
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
@@ -80,10 +81,16 @@ def check_all(
         check_frames(capture, view_sets, with_depth=with_depth, report=report)
 
 
-def warn_of(capture: Capture, view_sets_file: Path | None) -> None:
+def warn_of(
+    capture: Capture,
+    view_sets: Sequence[ViewSet],
+    view_sets_file: Path | None,
+    depth_range: tuple[float, float],
+) -> None:
     """Warnings of what may be a mistake, and one that names the frames without a pose."""
-    for doubt in capture.doubts:
-        warn(doubt)
+    for doubt in (*capture.doubts, doubtful_scale(capture, view_sets, depth_range)):
+        if doubt is not None:
+            warn(doubt)
     if capture.lost and view_sets_file is None:
         words = ids_in_words(sorted(capture.lost))
         warn(f"frames without a usable pose are left out: {words}")

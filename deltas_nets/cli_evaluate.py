@@ -94,7 +94,7 @@ class Evaluate(Prediction):
             view_sets = recorded_view_sets(self.predictions)
         else:
             view_sets = usable_view_sets(capture, self.view_sets, self.views)
-        warn_of(capture, self.view_sets or self.predictions)
+        warn_of(capture, view_sets, self.view_sets or self.predictions, self.depth_range)
         view_sets = with_depth_only(capture, view_sets)
         check_all(capture, view_sets, with_depth=True)
         if self.predictions is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from deltas_nets.data.capture import Capture, ids_in_words
 from deltas_nets.errors import UserError
 
-__all__ = ["ViewSet", "check_frames", "read_view_sets"]
+__all__ = ["ViewSet", "check_frames", "doubtful_scale", "read_view_sets"]
 
 
 class ViewSet(NamedTuple):
@@ -124,3 +124,31 @@ def _check_ids(
             what = f"{name} names frame {id}, which {capture.path} does not have"
             remedy = f"use its frames; the nearest are {ids_in_words(sorted(nearest))}"
             raise UserError(what, path, remedy)
+
+
+def doubtful_scale(
+    capture: Capture, view_sets: Sequence[ViewSet], depth_range: tuple[float, float]
+) -> str | None:
+    """Words for cameras that stand so near or far that their poses are hardly in metres.
+
+    Args:
+        capture: the frames.
+        view_sets: that are used.
+        depth_range: (near, far) of the search, metres.
+    """
+    used = {id for views in view_sets for id in (views.anchor, *views.sources)}
+    centres = {id: np.linalg.inv(capture.frame(id).cam_from_world)[:3, 3] for id in used}
+    baselines = [
+        float(np.linalg.norm(centres[source] - centres[views.anchor]))
+        for views in view_sets
+        for source in views.sources
+    ]
+    if not baselines:  # depth from a sensor, to be scored
+        return None
+    usual, (near, far) = float(np.median(baselines)), depth_range
+    if near / 250 <= usual <= far / 2:
+        return None
+    return (
+        f"views that go together stand {usual:.3g} m apart (median), and depth is searched from "
+        f"{near:g} to {far:g} m: are the poses in metres?"
+    )

@@ -12,8 +12,9 @@ from PIL import Image
 from run_command import Run, assert_one_line
 from small_scannet import SCANNET, opened
 
-from deltas_nets.data.capture import open_capture
+from deltas_nets.data.capture import Capture, Frame, open_capture
 from deltas_nets.data.readers.intrinsics import read_intrinsics
+from deltas_nets.data.view_sets import ViewSet, doubtful_scale
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]
@@ -96,6 +97,33 @@ def test_a_principal_point_far_from_the_middle_is_a_warning(
     assert str(file) in said
     file.write_text("60 0 46 0 60 24 0 0 1")
     assert open_capture(folder).doubts == ()
+
+
+@pytest.mark.parametrize(
+    ("step", "said"), [(150.0, "stand 225 m apart"), (1.5e-4, "0.000225 m apart")]
+)
+def test_poses_that_are_hardly_in_metres_are_a_warning(
+    run: Run, make_capture: MakeCapture, tmp_path: Path, step: float, said: str
+) -> None:
+    folder = make_capture(step=step)
+    warning, *_ = warnings_of(run, folder, tmp_path / "out")
+    assert said in warning and warning.endswith("are the poses in metres?")
+
+
+@given(step=st.floats(0.003, 4.9), num_frames=st.integers(2, 4))
+def test_baselines_that_suit_the_depth_range_are_no_doubt(
+    tmp_path_factory: pytest.TempPathFactory, step: float, num_frames: int
+) -> None:
+    K, poses = np.eye(3), np.tile(np.eye(4), (num_frames, 1, 1))
+    poses[:, 0, 3] = step * np.arange(num_frames)
+    frames = {id: Frame(id, Path(), (48, 64), K, pose) for id, pose in enumerate(poses)}
+    capture = Capture(path=Path(), frames=frames, lost={})
+    pairs = [ViewSet(id, (id + 1,)) for id in range(num_frames - 1)]
+    assert doubtful_scale(capture, pairs, (0.5, 10.0)) is None
+    # Whatever the unit, as long as the range is in it.
+    assert doubtful_scale(capture, pairs, (0.5 * step, 10 * step)) is None
+    assert doubtful_scale(capture, pairs, (500 * step, 1000 * step)) is not None
+    assert doubtful_scale(capture, [ViewSet(0, ())], (0.5, 10.0)) is None
 
 
 def test_depth_of_another_shape_without_intrinsics_is_a_warning(make_capture: MakeCapture) -> None:
