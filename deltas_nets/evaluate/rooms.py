@@ -1,6 +1,6 @@
 """How a network does on procedural rooms: exact truth, and no training sees them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Literal, Protocol
 
 import torch
@@ -12,6 +12,7 @@ from deltas_nets.config import TrainConfig
 from deltas_nets.data.augment import Photometry, disturb_poses, draw_pose_errors
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms
+from deltas_nets.data.workers import rendered_ahead
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
 from deltas_nets.evaluate.points import score_points
@@ -96,8 +97,7 @@ def score_rooms(
 ) -> CaptureScores:
     """Score the maps of all rooms, view 0 of each as anchor; rooms are named by their number."""
     meter, scores = CalibrationMeter(), dict[str, MapScores | None]()
-    for number in range(len(rooms)):
-        room = rooms[number]
+    for number, room in enumerate(_in_order(rooms)):
         prediction = predict_room(model, room, depth_range)
         truth = room.depth[0].numpy()
         depth = prediction.depth[0].cpu().numpy()
@@ -117,10 +117,15 @@ def measure_rooms(
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Let a meter look at the maps of all rooms."""
-    for number in range(len(rooms)):
-        room = rooms[number]
+    for number, room in enumerate(_in_order(rooms)):
         _measure(predict_room(model, room, depth_range), room, meter, depth_range)
         report(str(number))
+
+
+def _in_order(rooms: RoomViews) -> Iterable[PosedImages]:
+    if isinstance(rooms, Dataset):
+        return rendered_ahead(rooms, len(rooms))
+    return (rooms[number] for number in range(len(rooms)))  # in memory
 
 
 @torch.no_grad()

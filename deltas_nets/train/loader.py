@@ -15,10 +15,10 @@ from deltas_nets.config import TrainConfig
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.scannet_tuples import ScanNetTuples
 from deltas_nets.data.synthetic import Rooms
+from deltas_nets.data.workers import leave_to_the_parent
 from deltas_nets.errors import UserError
 from deltas_nets.train.data_sets import training_data
 from deltas_nets.train.shelves import Shelves, places_with_new_rooms
-from deltas_nets.train.stop import leave_to_the_trainer
 
 
 class Part(NamedTuple):
@@ -119,7 +119,7 @@ def step_loader(
         batch_sampler=sampler,
         num_workers=config.data.workers,
         collate_fn=_collate,
-        worker_init_fn=leave_to_the_trainer,
+        worker_init_fn=leave_to_the_parent,
     )
     for step, rooms in enumerate(loader, first):
         if isinstance(rooms, UserError):

@@ -1,20 +1,9 @@
 """Ctrl-C and SIGTERM end a run between two steps, so that none is lost or half done."""
 
-import os
 import signal
 import threading
 from types import FrameType
 from typing import Any
-
-
-def leave_to_the_trainer(worker: int) -> None:
-    """For the processes that render ahead: they leave the trainer's group.
-
-    Ctrl-C in a terminal, ``timeout`` and job schedulers send their signal to a whole group. It
-    must not end those processes before the trainer is done with its step; then it ends them.
-    """
-    if hasattr(os, "setpgrp"):  # not on Windows
-        os.setpgrp()
 
 
 class StopRequest:

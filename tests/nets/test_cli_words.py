@@ -5,7 +5,17 @@ from pathlib import Path
 import pytest
 from run_command import Run, assert_one_line
 
-COMMANDS = ("demo", "depth", "evaluate", "train", "recipe", "distill", "calibrate", "export", "cost")
+COMMANDS = (
+    "demo",
+    "depth",
+    "evaluate",
+    "train",
+    "recipe",
+    "distill",
+    "calibrate",
+    "export",
+    "cost",
+)
 
 
 def test_without_arguments_the_help_is_shown(run: Run) -> None:
