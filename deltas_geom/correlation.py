@@ -15,7 +15,7 @@ from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.pixels import normalizing, resize_pixels
-from deltas_geom.precision import without_autocast
+from deltas_geom.precision import at_least_single, promoted, without_autocast
 from deltas_geom.recompute import recomputed
 from deltas_geom.sampling import Samples
 
@@ -195,10 +195,9 @@ class _DotProducts(torch.autograd.Function):
             count, size = grid.shape[0], features.shape[-2:]
             # Only the gradient of the places reads the values of the maps.
             maps = rows @ flat if moves else rows.new_zeros(()).expand(count, 1, *size)
+            of_read = torch.where(mask, gradient, 0.0).reshape(count, 1, *pixels.shape[-3:-1])
             of_maps, of_grid = torch.ops.aten.grid_sampler_2d_backward(
-                torch.where(mask, gradient, 0.0)
-                .reshape(count, 1, *pixels.shape[-3:-1])
-                .contiguous(),
+                of_read.contiguous(),
                 maps.reshape(count, 1, *size),
                 grid,
                 interpolation_mode=0,  # bilinear
@@ -220,17 +219,16 @@ def _in_full(
     features: Tensor, descriptors: Tensor, pixels: Tensor, image_size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Features ``(*B, D, h w)``, descriptors, grid ``(*B n, O, S, 2)`` in float32 at least."""
-    dtype = torch.promote_types(features.dtype, descriptors.dtype)
-    dtype = torch.promote_types(dtype, torch.float32)
-    pixels = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
+    features, descriptors = promoted(at_least_single(features), descriptors)
+    pixels = at_least_single(pixels)
     # One pass along rows of x, y, x, y: four, two numbers wide, take as long as the sampling.
     count = pixels.shape[-2]
     shift, slope = (part.repeat(count) for part in normalizing(image_size, like=pixels))
-    grid = torch.addcmul(shift, pixels.flatten(-2), slope).to(dtype)
+    grid = torch.addcmul(shift, pixels.flatten(-2), slope).to(features.dtype)
     # The backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU). At
     # the border it has a value and no gradient.
     grid = grid.nan_to_num_(nan=-1.0).reshape(pixels.shape).flatten(0, -4)
-    return features.to(dtype).flatten(-2), descriptors.to(dtype), grid
+    return features.flatten(-2), descriptors, grid
 
 
 def _masked(values: Tensor, mask: Tensor) -> Tensor:
@@ -261,7 +259,7 @@ def _length_table(feature_map: Tensor) -> tuple[Tensor]:
     def squared(values: Tensor) -> Tensor:
         return values.square().sum(dim=-3)
 
-    features = feature_map.to(torch.promote_types(feature_map.dtype, torch.float32))
+    features = at_least_single(feature_map)
     along = right(features) - features
     length, step_x, step_y = squared(features), squared(along), squared(below(features) - features)
     twist = squared(below(along) - along)
@@ -275,8 +273,8 @@ def _inverse_lengths(
 ) -> tuple[Tensor]:
     """One by the length of the feature at pixels ``(*B, n, O, S, 2)``; 0 where it is nothing."""
     size = (table.shape[-2], table.shape[-1])
-    pixels = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
-    places = resize_pixels(pixels, old_size=image_size, new_size=size).to(table.dtype)
+    places = resize_pixels(at_least_single(pixels), old_size=image_size, new_size=size)
+    places = places.to(table.dtype)
     x, column = _cell(places[..., 0].flatten(-3), size[1])
     y, row = _cell(places[..., 1].flatten(-3), size[0])
     cell = (row * size[1] + column).unsqueeze(-2).expand(*table.shape[:-2], -1)

@@ -29,6 +29,16 @@ def safe_divide(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor
     return torch.where(where, numerator / torch.where(where, denominator, 1.0), 0.0)
 
 
+def safe_sqrt(squared: Tensor) -> Tensor:
+    """Square roots of any shape; 0 with zero gradient unless ``squared`` is positive.
+
+    At 0, as of a perfect match, the slope is infinite.
+    """
+    positive = squared > 0
+    # Double where, as above.
+    return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
+
+
 @without_autocast
 def from_homogeneous(coordinates: Tensor) -> Tensor:
     """Divide by the last coordinate: ``(*B, D + 1)`` to ``(*B, D)``.

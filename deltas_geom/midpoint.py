@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.chunks import in_chunks
-from deltas_geom.homogeneous import safe_divide
+from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
 from deltas_geom.poses import camera_centers
 from deltas_geom.precision import without_autocast
@@ -113,12 +113,10 @@ def _triangulate(
         along, squared_angle = _fit(seen, (x, y, z))
         weight = torch.where(seen.used, seen.squared, 0.0)
         mean = safe_divide((weight * squared_angle).sum(dim=-2), weight.sum(dim=-2), valid)
-        positive = mean > 0
         found = (
             torch.where(valid[..., None], torch.stack([x, y, z], dim=-1) + seen.around, 0.0),
             torch.where(valid.unsqueeze(-2), along, 0.0),
-            # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-            torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0),
+            safe_sqrt(mean),
             parallax_of(seen.centers, (x, y, z), seen.used.to(along.dtype)),
         )
         limit = torch.finfo(dtype).max

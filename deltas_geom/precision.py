@@ -17,6 +17,18 @@ def promoted(*tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(tensor.to(dtype) for tensor in tensors)
 
 
+def at_least_single(tensor: Tensor) -> Tensor:
+    """In float32 if it is of half precision, otherwise as it is.
+
+    Example:
+        >>> at_least_single(torch.ones(1, dtype=torch.bfloat16)).dtype
+        torch.float32
+        >>> at_least_single(torch.ones(1, dtype=torch.float64)).dtype
+        torch.float64
+    """
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
 def without_autocast(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Keep ``torch.autocast`` out of an operation: it computes in the dtypes of its arguments.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from deltas_geom.checks import check_shapes
 from deltas_geom.chunks import in_chunks
-from deltas_geom.homogeneous import safe_divide
+from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.ldl import Symmetric4, Vector4
 from deltas_geom.observations import (
     Vector3,
@@ -87,9 +87,7 @@ def triangulate_rays(
         squared = torch.where(used, seen.weights.squared, 0.0)
         total = squared.sum(dim=-2)
         mean = safe_divide((squared * angle.square()).sum(dim=-2), total, total > 0)
-        positive = mean > 0
-        # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-        residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
+        residual = safe_sqrt(mean)
         depth = torch.where(valid, along, 0.0)
         parallax = parallax_of(seen.centers, points, used.to(along.dtype))
         limit = torch.finfo(rays.dtype).max

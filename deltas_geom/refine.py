@@ -13,6 +13,7 @@ from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.chunks import in_chunks
+from deltas_geom.homogeneous import safe_sqrt
 from deltas_geom.normal_matrix import Symmetric3, normal_matrix, second_derivative, solve3_scaled
 from deltas_geom.observations import Observations, Vector3, check_weights, observe, over_views
 from deltas_geom.precision import without_autocast
@@ -21,6 +22,7 @@ Loss = Literal["squared", "huber", "cauchy"]
 
 _Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
+_Descent = Callable[["_Problem", int], _End]
 _FARTHEST = 1e10  # px: a projection farther out than this is as good as behind the camera
 
 
@@ -70,7 +72,8 @@ def refine_points(
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
         pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything.
-        points: ``(*B, N, 3)`` in the world, metres: where to start.
+        points: ``(*B, N, 3)`` in the world, metres: where to start. The (0, 0, 0) of a failed
+            triangulation is a place like any other: only what was valid before still is.
         weights: ``(*B, V, N)`` not negative (a sign has no effect). 0 = unused. Only their
             ratios count.
         mask: ``(*B, V, N)`` bool, True = used.
@@ -110,18 +113,12 @@ def refine_points(
         raise ValueError(f"steps must not be negative, got {steps}")
     if not scale > 0:
         raise ValueError(f"scale must be positive, got {scale}")
-    robust = partial(_robust, loss, scale)
 
-    def unrolled(*inputs: Tensor) -> tuple[Tensor, ...]:
-        problem = _pose(robust, *inputs)
-        return _outward(problem, *_descend(problem, steps), dtype=points.dtype)
+    def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:
+        problem = _pose(partial(_robust, loss, scale), *inputs)
+        return _outward(problem, *descend(problem, steps), dtype=points.dtype)
 
-    def implicit(*inputs: Tensor) -> tuple[Tensor, ...]:
-        problem = _pose(robust, *inputs)
-        with torch.no_grad():
-            end = _descend(problem, steps)
-        return _outward(problem, *_with_implicit_gradient(problem, end), dtype=points.dtype)
-
+    unrolled, implicit = partial(refined, _descend), partial(refined, _descend_implicitly)
     derivable = unrolled if gradient == "unrolled" else implicit
     known = ((pixels, -2), (points, -2), (weights, -1), (mask, -1))
     return Refined(*in_chunks(derivable, unrolled, proj, known, dims=(-2, -1, -1)))
@@ -265,13 +262,15 @@ def _normal_equations(problem: _Problem, fit: _Fit) -> tuple[Symmetric3, Vector3
     return (m00, m01, m02, m11, m12, m22), (r0, r1, r2)
 
 
-def _with_implicit_gradient(problem: _Problem, end: _End) -> _End:
-    """The same, with the derivatives of the point at which the cost's gradient g is 0.
+def _descend_implicitly(problem: _Problem, steps: int) -> _End:
+    """:func:`_descend`, with the derivatives of the point at which the cost's gradient g is 0.
 
     They are -H^-1 dg with the cost's whole second derivative H. Gauss-Newton's normal matrix,
     which leaves out how residuals and losses bend, would be wrong by their share.
     """
-    (x, y, z), valid = (component.detach() for component in end[0]), end[2]
+    with torch.no_grad():
+        end, _, valid = _descend(problem, steps)
+    x, y, z = (component.detach() for component in end)
     fit = _fit(problem, (x, y, z))
     normal, right = _normal_equations(problem, fit)
     seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
@@ -294,9 +293,7 @@ def _outward(
     # What failed keeps the caller's own digits, and no gradient.
     kept, total = problem.start.detach(), problem.observed.weights.squared.sum(dim=-2)
     found = torch.where(valid.unsqueeze(-2), torch.stack(points, dim=-2), kept).mT
-    positive = valid & (error > 0)
-    # The largest squared weight is 1: less is no view. sqrt has an infinite slope at a perfect
-    # match; its gradient there is taken as 0.
-    root = (torch.where(positive, error, 1.0) / total.clamp(min=1)).sqrt()
-    residual = torch.where(positive, root, 0.0).clamp(max=torch.finfo(dtype).max)
+    # The largest squared weight is 1: less is no view.
+    residual = safe_sqrt(torch.where(valid, error, 0.0) / total.clamp(min=1))
+    residual = residual.clamp(max=torch.finfo(dtype).max)
     return found.to(dtype).contiguous(), residual.to(dtype), valid

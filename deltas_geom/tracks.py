@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import ShapeError, check_index, check_shapes
-from deltas_geom.homogeneous import safe_divide
+from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Vector3
 from deltas_geom.precision import without_autocast
@@ -124,9 +124,7 @@ def triangulate_tracks(
         errors = summed(squared * (dx * dx + dy * dy), listed.point, num_points)
         total = summed(squared, listed.point, num_points)
         mean = safe_divide(errors, total, total > 0)
-        positive = mean > 0
-        # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-        residual = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
+        residual = safe_sqrt(mean)
         limit = torch.finfo(proj.dtype).max
         outward = (
             found.to(proj.dtype).clamp(-limit, limit)

@@ -13,6 +13,7 @@ from torch import Tensor
 from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.fundamental import cross_matrix
+from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.observations import solver_dtype
 from deltas_geom.precision import without_autocast
 from deltas_geom.status import Status
@@ -82,13 +83,11 @@ def triangulate_two_view(
         valid = status == Status.OK.value
         both = valid.unsqueeze(-2)
         mean = torch.where(both.unsqueeze(-2), solved.shift, 0.0).square().sum(dim=(-3, -2)) / 2
-        positive = mean > 0
         found = (
             torch.where(valid[..., None], solved.points.mT, 0.0),
             torch.where(both.unsqueeze(-2), seen.xy - solved.shift, seen.xy.detach()).mT,
             torch.where(both, solved.depth, 0.0),
-            # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-            torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0),
+            safe_sqrt(mean),
             torch.where(valid, solved.parallax, 0.0),
         )
         limit = torch.finfo(dtype).max
@@ -134,9 +133,7 @@ def _rig(proj: Tensor) -> _Rig:
     fundamental = inverse[..., 0, :, :].mT @ baseline @ inverse[..., 1, :, :]
     largest = fundamental.detach().abs().amax(dim=(-2, -1), keepdim=True)
     exists = (largest > 0) & largest.isfinite()
-    # Double where: cameras in one place must not turn the gradient into NaN.
-    fundamental = torch.where(exists, fundamental, 0.0) / torch.where(exists, largest, 1.0)
-    return _Rig(fundamental, inverse, centers)
+    return _Rig(safe_divide(fundamental, largest, exists), inverse, centers)
 
 
 def _inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,8 +145,8 @@ def _inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     # The square of the determinant, in the gradient, has to be representable.
     regular = (size > limits.tiny**0.4) & (size < limits.max**0.4)
     regular = regular & (size > 4 * limits.eps * matrix.detach().norm(dim=-1).prod(dim=-1))
-    inverse = torch.stack(columns, dim=-1) / torch.where(regular, determinant, 1.0)[..., None, None]
-    return torch.where(regular[..., None, None], inverse, 0.0), regular
+    adjugate, exists = torch.stack(columns, dim=-1), regular[..., None, None]
+    return safe_divide(adjugate, determinant[..., None, None], exists), regular
 
 
 class _Seen(NamedTuple):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_bool, check_shapes
-from deltas_geom.homogeneous import safe_divide
+from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.normal_matrix import Symmetric3, inverse3, normal_matrix
 from deltas_geom.observations import Vector3, projection_centers, solver_dtype
 from deltas_geom.precision import promoted, without_autocast
@@ -163,9 +163,7 @@ def residual_of(found: Reprojection, xy: Tensor, squared: Tensor) -> Tensor:
     errors = ((dx * dx + dy * dy) * squared).sum(dim=-2)
     total = squared.sum(dim=-2)
     mean = safe_divide(errors, total, total > 0)
-    positive = mean > 0
-    # sqrt has an infinite slope at a perfect match; its gradient there is taken as 0.
-    return torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
+    return safe_sqrt(mean)
 
 
 @torch.no_grad()

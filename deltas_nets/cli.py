@@ -10,7 +10,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import shorten
-from typing import Annotated, NoReturn
+from typing import Annotated, NoReturn, get_args
 
 import tyro
 
@@ -20,7 +20,7 @@ from deltas_nets.cli_distill import Distill
 from deltas_nets.cli_evaluate import Evaluate
 from deltas_nets.cli_export import Export
 from deltas_nets.cli_prediction import Prediction
-from deltas_nets.cli_recipe import MakeWeights
+from deltas_nets.cli_recipe import Recipe
 from deltas_nets.cli_training import Cost, Flag, Train, preset_of
 from deltas_nets.config import TRAIN_CONFIGS, to_dict
 from deltas_nets.errors import UserError
@@ -155,11 +155,11 @@ def main() -> None:
             raise
         _fail(error)
     except KeyboardInterrupt:
-        print("deltas: stopped; what is finished is kept", file=sys.stderr)
+        print(f"deltas: stopped; {_how_to_go_on(command)}", file=sys.stderr)
         sys.exit(130)
 
 
-Command = Demo | Depth | Evaluate | Train | MakeWeights | Distill | Calibrate | Export | Cost
+Command = Demo | Depth | Evaluate | Train | Recipe | Distill | Calibrate | Export | Cost
 
 
 def _parse(arguments: list[str]) -> Command:
@@ -168,11 +168,10 @@ def _parse(arguments: list[str]) -> Command:
     preset = preset_of(arguments)
     default = Train(out=Path("runs") / preset, preset=preset, config=TRAIN_CONFIGS[preset])
     train = Annotated[Train, tyro.conf.subcommand(name="train", default=default)]
-    recipe = Annotated[MakeWeights, tyro.conf.subcommand(name="recipe")]
     try:
         with contextlib.redirect_stderr(said):
             command: Command = tyro.cli(
-                Demo | Depth | Evaluate | train | recipe | Distill | Calibrate | Export | Cost,
+                Demo | Depth | Evaluate | train | Recipe | Distill | Calibrate | Export | Cost,
                 prog="deltas",
                 description="Metric depth from posed images.",
                 args=arguments,
@@ -200,19 +199,19 @@ def _in_words(box: str) -> str:
     return re.sub(r"^Error parsing (__tyro\S+|[A-Z]\w+:) ", "", said)
 
 
+def _how_to_go_on(command: Command) -> str:
+    match command:
+        case Depth() | Recipe():
+            return "the same command goes on"
+        case Train():
+            return "the same command with --resume goes on"
+        case _:
+            return "nothing was written"
+
+
 def _help_of(arguments: list[str]) -> str:
-    commands = (
-        "demo",
-        "depth",
-        "evaluate",
-        "train",
-        "recipe",
-        "distill",
-        "calibrate",
-        "export",
-        "cost",
-    )
-    known = [word for word in arguments[:1] if word in commands]
+    names = {command.__name__.lower() for command in get_args(Command)}
+    known = [word for word in arguments[:1] if word in names]
     return " ".join(["see deltas", *known, "--help"])
 
 

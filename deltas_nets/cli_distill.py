@@ -12,8 +12,8 @@ class Distill(DistillConfig):
 
     Nothing else of the network changes. The teacher looks at every picture of a pool from several
     sides and keeps what it finds from most; the student learns to find that in other light. The
-    weights say whose points they know, with the licence of the teacher's own. Calibrate them
-    afterwards: other points have other errors.
+    weights say whose points they know, with the licence of the teacher's own. They have lost their
+    calibration: other points have other errors.
 
     Example: deltas distill --teacher aliked --teacher-weights aliked-n16.pth --out mine.safetensors
     """
@@ -37,3 +37,4 @@ class Distill(DistillConfig):
             distill(self, device=device, overwrite=self.overwrite, report=report)
         loss = read_metadata(self.out)["detector_loss"]
         print(f"weights in {self.out}, loss {loss} at the end")
+        print(f"not calibrated: deltas calibrate --weights {self.out} --out FILE")

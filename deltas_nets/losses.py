@@ -134,7 +134,7 @@ def smoothness_loss(depth: Tensor, image: Tensor) -> Tensor:
     """Edge-aware smoothness of inverse depth, relative to its mean (paper: L_sm)."""
     inverse = 1 / depth
     relative = inverse / inverse.mean(dim=(-2, -1), keepdim=True).detach()
-    loss: Tensor = inverse_depth_smoothness_loss(relative, image)
+    loss: Tensor = inverse_depth_smoothness_loss(relative, image.to(relative.dtype))
     return loss
 
 

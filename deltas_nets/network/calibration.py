@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from deltas_geom.precision import at_least_single
+
 VIEWS = (2, 3, 5, 8)
 """Numbers of views, the anchor included, that have a curve of their own."""
 NUM_KNOTS = 8
@@ -33,7 +35,8 @@ class Curve(NamedTuple):
 
     def __call__(self, log_std: Tensor) -> Tensor:
         """Correct log standard deviations of any shape; beyond the ends by a constant factor."""
-        widths = self.knots.diff()
+        # In half precision neighbours may be rounded to the same knot: a step.
+        widths = self.knots.diff().clamp_min(1e-4)
         slopes = self.values.diff() / widths
         # How far each value climbs up each of the segments.
         climbed = (log_std[..., None] - self.knots[:-1]).clamp_min(0).minimum(widths)
@@ -74,7 +77,8 @@ class SpreadCalibration(nn.Module):
         # Increasing whatever the share is: the mean of two increasing sequences.
         share = math.log(count / few) / math.log(many / few)
         of_few, of_many = Curve(*self._row(upper - 1)), Curve(*self._row(upper))
-        return Curve(*(torch.lerp(*pair, share) for pair in zip(of_few, of_many, strict=True)))
+        pairs = zip(map(at_least_single, of_few), map(at_least_single, of_many), strict=True)
+        return Curve(*(torch.lerp(few, many, share) for few, many in pairs))
 
     def set(self, num_views: int, curve: Curve) -> None:
         """Take over a fitted curve.

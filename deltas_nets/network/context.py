@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from deltas_nets.network.layers import zero_initialised
+from deltas_nets.network.layers import WideConv1d, WideLinear, zero_initialised
 
 WIDTH = 64
 """Channels of a point's embedding."""
@@ -37,7 +37,7 @@ class Context(nn.Module):
     def __init__(self, feature_dim: int, *, rounds: int, heads: int) -> None:
         super().__init__()
         self.embed = nn.Sequential(
-            nn.Linear(feature_dim + 4, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH)
+            WideLinear(feature_dim + 4, WIDTH), nn.ReLU(), WideLinear(WIDTH, WIDTH)
         )
         # Two rounds listen from the start. Further ones begin as the identity, so that weights from
         # before there were any give the depth they were trained for.
@@ -68,9 +68,9 @@ class _Round(nn.Module):
     def __init__(self, width: int, heads: int, gain: float) -> None:
         super().__init__()
         self.heads = heads
-        self.query = nn.Linear(width, 16 * heads)
-        self.key = nn.Linear(width, 16 * heads)
-        self.trust = nn.Linear(width, heads)
+        self.query = WideLinear(width, 16 * heads)
+        self.key = WideLinear(width, 16 * heads)
+        self.trust = WideLinear(width, heads)
         # Attention falls off with distance; the heads start from near to far.
         self.log_reach = nn.Parameter(torch.linspace(-2.5, -0.7, heads))
         self.gain = nn.Parameter(torch.full((heads,), gain))
@@ -99,7 +99,7 @@ class _Round(nn.Module):
 def smooth_scores(inputs: int) -> nn.Sequential:
     """A correction of scores by their neighbours along the samples; it starts as none."""
     return nn.Sequential(
-        nn.Conv1d(inputs, 12, 5, padding=2),
+        WideConv1d(inputs, 12, 5, padding=2),
         nn.ReLU(),
-        zero_initialised(nn.Conv1d(12, 1, 5, padding=2)),
+        zero_initialised(WideConv1d(12, 1, 5, padding=2)),
     )

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
+from deltas_geom.precision import at_least_single
 from deltas_nets.network.calibration import SpreadCalibration
 from deltas_nets.network.convex_upsampling import ConvexUpsampling, convex_upsample
 from deltas_nets.network.encoder import CHANNELS, Features
@@ -134,23 +135,25 @@ class Densifier(nn.Module):
         """
         anchor = features.of_anchor()
         known = interpolate_sparse(sparse)
-        x4 = self.down4(torch.cat([self.enter(torch.cat(known, dim=1)), anchor.quarter], dim=1))
+        # Sparse depth is geometry, in float32 at least, and the maps may be of half precision.
+        given = self.enter(torch.cat(known, dim=1).to(anchor.quarter.dtype))
+        x4 = self.down4(torch.cat([given, anchor.quarter], dim=1))
         x8 = self.join8(torch.cat([self.down8(x4), anchor.eighth], dim=1))
         x16 = self.join16(torch.cat([self.down16(x8), anchor.sixteenth], dim=1))
         y8 = self.up8(torch.cat([upsample_like(x16, x8), x8], dim=1))
         y4 = self.up4(torch.cat([upsample_like(y8, x4), x4], dim=1))
 
-        correction = self.correct[3](x16).float()
+        correction = at_least_single(self.correct[3](x16))
         depths = [_pooled_like(known.log_depth, correction) + correction]
         for layer, features_here in ((self.correct[2], y8), (self.correct[1], y4)):
-            correction = upsample_like(correction, features_here) + layer(features_here).float()
+            here = at_least_single(layer(features_here))
+            correction = upsample_like(correction, features_here) + here
             depths.append(_pooled_like(known.log_depth, correction) + correction)
         base = upsample_like(depths[-1], anchor.half)
-        y2 = self.up2(
-            torch.cat([upsample_like(y4, anchor.half), anchor.half, anchor.fine, base], dim=1)
-        )
-        half = base + self.correct[0](y2).float()
-        log_spread = self.spread(y2).float().clamp(-6, 2)
+        finest = [upsample_like(y4, anchor.half), anchor.half, anchor.fine]
+        y2 = self.up2(torch.cat([*finest, base.to(anchor.half.dtype)], dim=1))
+        half = base + at_least_single(self.correct[0](y2))
+        log_spread = at_least_single(self.spread(y2)).clamp(-6, 2)
         logits = self.upsampling(y2)
         # The last cell of an odd side reaches beyond the image.
         height, width = sparse.depth.shape[-2:]

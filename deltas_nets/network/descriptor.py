@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from deltas_geom.precision import at_least_single
 from deltas_nets.network.encoder import CHANNELS, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like
 
@@ -57,10 +58,10 @@ class Descriptor(nn.Module):
             lateral = self.lateral[level](finer[level])
             pyramid = self.merge[level](lateral + upsample_like(pyramid, lateral))
             coarse_to_fine.append(pyramid)
-        context = coarse_to_fine[0].float()
+        context = at_least_single(coarse_to_fine[0])
         if self.stride == 2:
             pyramid = torch.cat([pyramid, flat.fine], dim=1)
-        unit = F.normalize(self.head(pyramid).float(), dim=1)
+        unit = F.normalize(at_least_single(self.head(pyramid)), dim=1)
         return Descriptors(
             unit.reshape(*batch, *unit.shape[1:]), context.reshape(*batch, *context.shape[1:])
         )

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from kornia.geometry.subpix import nms2d
 from torch import Tensor, nn
 
+from deltas_geom.precision import at_least_single
 from deltas_nets.config import DetectorConfig
 from deltas_nets.network.encoder import CHANNELS, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
@@ -56,7 +57,7 @@ class FineLogits(nn.Module):
             fine: ``(B, 16, ceil(H/2), ceil(W/2))``.
             like: ``(B, 65, h, w)`` the logits.
         """
-        pixels = F.pixel_shuffle(self.convs(fine).float(), 2)
+        pixels = F.pixel_shuffle(at_least_single(self.convs(fine)), 2)
         rows, columns = CELL * like.shape[-2], CELL * like.shape[-1]
         missing = (0, columns - pixels.shape[-1], 0, rows - pixels.shape[-2])
         cells = F.pixel_unshuffle(F.pad(pixels, missing), CELL)
@@ -93,7 +94,7 @@ class Detector(nn.Module):
         """
         anchor = features.of_anchor()
         coarse = upsample_like(self.coarse(anchor.sixteenth), anchor.eighth)
-        logits = self.head(torch.cat([coarse, anchor.eighth], dim=1)).float()
+        logits = at_least_single(self.head(torch.cat([coarse, anchor.eighth], dim=1)))
         if self.fine is not None:
             logits = logits + self.fine(anchor.fine, like=logits)
         return choose_keypoints(
@@ -123,13 +124,15 @@ def choose_keypoints(
     # CUDA has read so small a table when the call returns, and is not waited for; other devices
     # may read it later.
     spread = spread_points(count, image_size=image_size)
-    spread = spread.to(device, non_blocking=device.type == "cuda")
+    dtype = torch.promote_types(logits.dtype, torch.float32)  # halves do not know every pixel
+    spread = spread.to(device, dtype, non_blocking=device.type == "cuda")
     if shift is None:
         shift = torch.zeros(len(logits), 2, device=device)
     # Not torch.tensor, which copies numbers of the host to the device and waits for them.
-    size = torch.linspace(width, height, 2, device=device)
+    size = torch.linspace(width, height, 2, device=device, dtype=dtype)
     pixels = (spread + (shift[:, None] * size).floor()).remainder(size)
-    best, scores = _best(detector_heatmap(logits.detach(), image_size=image_size), config, count)
+    heatmap = detector_heatmap(logits.detach().to(dtype), image_size=image_size)
+    best, scores = _best(heatmap, config, count)
     detected = scores > config.threshold
     pixels[:, : best.shape[1]] = torch.where(detected[..., None], best, pixels[:, : best.shape[1]])
     padded = F.pad(torch.where(detected, scores, 0.0), (0, count - scores.shape[1]))

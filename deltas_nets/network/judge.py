@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from deltas_geom import Matches, PosedViews, Triangulation
 from deltas_geom.homogeneous import safe_divide
 from deltas_nets.network.context import WIDTH
+from deltas_nets.network.layers import WideLinear
 from deltas_nets.network.matcher import Decision, Posterior
 from deltas_nets.network.parallax import parallax_of, relative_error_per_pixel
 
@@ -27,10 +28,10 @@ class Judge(nn.Module):
     def __init__(self, window: int) -> None:
         super().__init__()
         self.window = window
-        last = nn.Linear(32, 1)
+        last = WideLinear(32, 1)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
-        self.correction = nn.Sequential(nn.Linear(WIDTH + NUM_CLUES, 32), nn.ReLU(), last)
+        self.correction = nn.Sequential(WideLinear(WIDTH + NUM_CLUES, 32), nn.ReLU(), last)
 
     def forward(
         self,

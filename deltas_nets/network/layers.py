@@ -3,6 +3,8 @@
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from deltas_geom.precision import promoted
+
 
 class ConvBlock(nn.Sequential):
     """Convolution, batch norm, ReLU."""
@@ -13,6 +15,49 @@ class ConvBlock(nn.Sequential):
             nn.BatchNorm2d(outputs),
             nn.ReLU(inplace=True),
         )
+
+
+class WideLinear(nn.Linear):
+    """A linear layer in the dtype to which its input and its weights promote.
+
+    Layers that read geometry need it: in a network of half precision geometry stays in float32.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(*B, inputs)`` to ``(*B, outputs)``."""
+        return F.linear(*promoted(input, self.weight, self.bias))
+
+
+class WideConv1d(nn.Conv1d):
+    """A convolution with a bias, likewise."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(B, inputs, S)`` to ``(B, outputs, S)``."""
+        assert self.bias is not None
+        output: Tensor = self._conv_forward(*promoted(input, self.weight, self.bias))
+        return output
+
+
+class WideBatchNorm1d(nn.BatchNorm1d):
+    """Batch norm, likewise; its statistics are kept in their own dtype."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(B, C)`` of the same shape."""
+        if input.dtype == self.weight.dtype:
+            return super().forward(input)
+        assert self.running_mean is not None and self.running_var is not None
+        assert self.num_batches_tracked is not None and self.momentum is not None
+        input, mean, variance, weight, bias = promoted(
+            input, self.running_mean, self.running_var, self.weight, self.bias
+        )
+        normed = F.batch_norm(
+            input, mean, variance, weight, bias, self.training, self.momentum, self.eps
+        )
+        if self.training:
+            self.running_mean.copy_(mean)
+            self.running_var.copy_(variance)
+            self.num_batches_tracked.add_(1)
+        return normed
 
 
 def upsample_like(coarse: Tensor, fine: Tensor) -> Tensor:

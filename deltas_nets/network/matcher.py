@@ -29,6 +29,7 @@ from deltas_nets.network.inverse_depths import (
     samples_per_bin,
     subdivide,
 )
+from deltas_nets.network.layers import WideLinear
 from deltas_nets.network.refine import RefineMatches
 
 
@@ -94,7 +95,7 @@ class JointMatcher(nn.Module):
         self.context = Context(
             descriptor_dim + WIDTH, rounds=config.context_rounds, heads=config.context_heads
         )
-        self.confidence = nn.Sequential(nn.Linear(4, 16), nn.ReLU(), nn.Linear(16, 1))
+        self.confidence = nn.Sequential(WideLinear(4, 16), nn.ReLU(), WideLinear(16, 1))
         self.refine = RefineMatches(config.refine_radius)
 
     def forward(
@@ -173,7 +174,7 @@ class JointMatcher(nn.Module):
         weight = seen * (self.visibility * correlation).exp()
         total = weight.sum(dim=1)
         fused = (weight * correlation).sum(dim=1) / total.clamp_min(1e-6)
-        return torch.where(seen.any(dim=1), fused, -0.2), seen.float().mean(dim=1)
+        return torch.where(seen.any(dim=1), fused, -0.2), seen.to(fused.dtype).mean(dim=1)
 
 
 def at_keypoints(

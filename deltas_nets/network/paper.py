@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
+from deltas_geom.precision import at_least_single
 from deltas_nets.config import DetectorConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.calibration import SpreadCalibration
@@ -113,9 +114,13 @@ class PaperDetector(nn.Module):
         shift: Tensor | None = None,
     ) -> Keypoints:
         """See :class:`deltas_nets.network.detector.Detector`."""
-        logits = self.head(features.of_anchor(), image_size=image_size).logits.float()
+        logits = self.head(features.of_anchor(), image_size=image_size).logits
         return choose_keypoints(
-            logits, self.config, image_size=image_size, num_keypoints=num_keypoints, shift=shift
+            at_least_single(logits),
+            self.config,
+            image_size=image_size,
+            num_keypoints=num_keypoints,
+            shift=shift,
         )
 
 
@@ -128,8 +133,8 @@ class PaperDescriptor(nn.Module):
 
     def forward(self, features: ViewTaps) -> Descriptors:
         """Descriptors of all views; no context, the per-view matcher reads none."""
-        unit = self.head(features.taps, image_size=features.image_size).unit.float()
-        maps = unit.unflatten(0, (-1, features.num_views))
+        unit = self.head(features.taps, image_size=features.image_size).unit
+        maps = at_least_single(unit.unflatten(0, (-1, features.num_views)))
         return Descriptors(maps, maps[:, :, :0])
 
 
@@ -158,5 +163,5 @@ class PaperDensifier(nn.Module):
     def forward(self, features: ViewTaps, sparse: SparseDepth) -> DenseDepth:
         """Densify ``(B, 1, H, W)`` sparse depth of the anchor."""
         maps = self.net.maps(features.of_anchor(), sparse.depth)
-        depths = (depth.float() for depth in self.net.decoder.depths(maps))
-        return DenseDepth(tuple(depths), self.spread(maps.half).float().clamp(-6, 2))
+        depths = (at_least_single(depth) for depth in self.net.decoder.depths(maps))
+        return DenseDepth(tuple(depths), at_least_single(self.spread(maps.half)).clamp(-6, 2))

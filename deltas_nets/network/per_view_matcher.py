@@ -21,6 +21,7 @@ from deltas_geom.precision import promoted, without_autocast
 from deltas_geom.recompute import recomputed
 from deltas_nets.config import MatcherConfig
 from deltas_nets.network.descriptor import Descriptors
+from deltas_nets.network.layers import WideBatchNorm1d
 from deltas_nets.network.matcher import Matched, Posterior, at_keypoints
 
 
@@ -30,7 +31,7 @@ class PerViewMatcher(nn.Module):
     def __init__(self, config: MatcherConfig, descriptor_dim: int) -> None:
         super().__init__()
         self.config = config
-        self.norm = nn.BatchNorm1d(1)
+        self.norm = WideBatchNorm1d(1)
         self.log_scale = nn.Parameter(torch.tensor(2.0))
 
     def forward(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import Matches, in_image, sample_map, soft_argmax
+from deltas_nets.network.layers import WideLinear
 
 _ALONG, _ACROSS = 9, 3
 
@@ -25,7 +26,7 @@ class RefineMatches(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(2.5))
         # Without evidence the match stays: a Gaussian prior, wider along the line than across.
         self.log_spread = nn.Parameter(torch.tensor([0.0, -0.7]))
-        self.trust = nn.Linear(3, 1)
+        self.trust = WideLinear(3, 1)
 
     def forward(
         self, matches: Matches, anchor: Tensor, maps: Tensor, *, image_size: tuple[int, int]
@@ -42,11 +43,12 @@ class RefineMatches(nn.Module):
         direction = _line_direction(matches.covariance[:, 1:])
         normal = torch.stack([-direction[..., 1], direction[..., 0]], dim=-1)
         axes = torch.stack([direction, normal], dim=-2)  # (B, V-1, N, 2, 2)
-        places = pixels.unsqueeze(-2) + self.window @ axes
+        window = self.window.to(axes.dtype)
+        places = pixels.unsqueeze(-2) + window @ axes
         read = sample_map(maps[:, 1:], places.flatten(-3, -2), image_size=image_size)
         read = read.reshape(*places.shape[:-1], -1)  # (B, V-1, N, 27, D)
         correlation = (read @ anchor[:, None, :, :, None]).squeeze(-1)
-        prior = (self.window * torch.exp(-self.log_spread)).square().sum(-1) / 2
+        prior = (window * torch.exp(-self.log_spread)).square().sum(-1) / 2
         found = soft_argmax(
             correlation * self.log_scale.exp() - prior,
             places,

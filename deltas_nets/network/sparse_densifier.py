@@ -158,7 +158,8 @@ class SparseDensifier(nn.Module):
 
     def maps(self, image_taps: Taps, sparse: Tensor) -> DecoderMaps:
         """What the depths are read from."""
-        joined = join_taps(image_taps, self.encoder(sparse))
+        # Sparse depth is geometry, in float32 at least, and the maps may be of half precision.
+        joined = join_taps(image_taps, self.encoder(sparse.to(image_taps.half.dtype)))
         maps: DecoderMaps = self.decoder(joined, image_size=(sparse.shape[-2], sparse.shape[-1]))
         return maps
 

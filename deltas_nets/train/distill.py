@@ -7,11 +7,13 @@ head on top, in seconds per thousand steps. The paper distils from SuperPoint in
 (section 3.1). The command is `deltas distill`.
 """
 
+import json
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -32,6 +34,22 @@ __all__ = ["DistillConfig", "distill", "record_of", "train_detector", "with_fine
 
 RECENT = 200
 """Steps whose mean loss is recorded: a step's own depends on which pictures it drew."""
+DIVERGED = 2.0
+"""Times the first loss, which is that of a detector that knows something."""
+_OF_OTHER_WEIGHTS = ("format", "network", "torch", "calibration")
+_PLACES = ("teacher_weights", "out", "init", "cache")
+
+
+class Learned(NamedTuple):
+    """Losses of a training.
+
+    Attributes:
+        first: ``()`` of the first step.
+        last: ``()`` mean of the last 200 steps, or of all if there are fewer.
+    """
+
+    first: Tensor
+    last: Tensor
 
 
 def distill(
@@ -75,8 +93,10 @@ def distill(
     model.to(device)
     # The encoder of before has the same weights as the wider network's.
     lessons = prepare(encoder.to(device), teacher, config, report=report)
-    loss = train_detector(model, lessons, config, report=report)
-    save_weights(config.out, model, record_of(config, read_metadata(source), loss))
+    learned = train_detector(model, lessons, config, report=report)
+    check_learned(learned, config)
+    model.calibration.reset()  # it was fitted to the errors of other points
+    save_weights(config.out, model, record_of(config, read_metadata(source), learned.last))
     return config.out
 
 
@@ -112,7 +132,7 @@ def train_detector(
     config: DistillConfig,
     *,
     report: Callable[[str], None] = lambda _: None,
-) -> Tensor:
+) -> Learned:
     """Train the detector head in place; every other weight and statistic stays as it is.
 
     Args:
@@ -122,7 +142,7 @@ def train_detector(
         report: called after each step.
 
     Returns:
-        ``()`` mean loss of the last 200 steps, or of all if there are fewer.
+        The losses.
     """
     encoder = model.encoder
     assert isinstance(encoder, Encoder)
@@ -134,6 +154,7 @@ def train_detector(
     # Of all steps at once: a copy in every step would wait for the device.
     order = torch.randint(len(lessons.scores), shape, generator=random).to(lessons.scores.device)
     recent: deque[Tensor] = deque(maxlen=RECENT)
+    first = torch.full((), torch.inf)
     for step, chosen in enumerate(order):
         for group in optimizer.param_groups:
             group["lr"] = config.learning_rate * _rate_factor(step, config.steps)
@@ -145,9 +166,18 @@ def train_detector(
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         recent.append(loss.detach())
+        first = loss.detach() if step == 0 else first
         report(f"step {step + 1} of {config.steps}")
     model.eval()
-    return torch.stack(list(recent)).mean()
+    return Learned(first, torch.stack(list(recent)).mean())
+
+
+def check_learned(learned: Learned, config: DistillConfig) -> None:
+    """Raise ``UserError`` if training diverged."""
+    if not bool(learned.last <= DIVERGED * learned.first):
+        first, last = (float(loss) for loss in learned)
+        what = f"training diverged: the loss went from {first:.3g} to {last:.3g}"
+        raise UserError(what, f"--learning-rate {config.learning_rate:g}", "give a lower one")
 
 
 def _features(encoder: Encoder, batch: Lessons) -> Features:
@@ -177,7 +207,7 @@ def record_of(config: DistillConfig, before: dict[str, str], loss: Tensor) -> di
         before: the record of the weights that it started from.
         loss: ``()`` of the last steps.
     """
-    kept = {k: v for k, v in before.items() if k not in ("format", "network", "torch")}
+    kept = {k: v for k, v in before.items() if k not in _OF_OTHER_WEIGHTS}
     taught = f"detector distilled from {config.teacher}"
     # A teacher is named once, however often it taught, and the last one last.
     parts = before.get("origin", "unknown weights").split("; ")
@@ -186,12 +216,23 @@ def record_of(config: DistillConfig, before: dict[str, str], loss: Tensor) -> di
         "detector_teacher": config.teacher,
         "detector_teacher_file": config.teacher_weights.name,
         "detector_teacher_licence": LICENCES[config.teacher],
-        "detector_data": (
-            f"{config.num_images} pictures: views of procedural rooms {FIRST_ROOM}.."
-            f"{FIRST_ROOM + NUM_ROOMS}, and crops of photographs of scikit-image"
-        ),
-        "detector_adaptation": str(config.adaptation),
+        "detector_data": f"{config.num_images} pictures: {_pictures(config)}",
+        "detector_config": json.dumps(_public(config)),
         "detector_steps": str(config.steps),
         "detector_seed": str(config.seed),
         "detector_loss": f"{float(loss):.4f}",
     }
+
+
+def _pictures(config: DistillConfig) -> str:
+    rooms = f"views of procedural rooms {FIRST_ROOM}..{FIRST_ROOM + NUM_ROOMS}"
+    photographs = "crops of photographs of scikit-image"
+    if config.picture_share in (0, 1):
+        return photographs if config.picture_share else rooms
+    return f"{rooms}, and {photographs}"
+
+
+def _public(config: DistillConfig) -> dict[str, Any]:
+    """The settings without where files are, which is the machine's and private."""
+    own = {field.name: getattr(config, field.name) for field in fields(DistillConfig)}
+    return {name: value for name, value in own.items() if name not in _PLACES}

@@ -1,13 +1,79 @@
 """Run a recipe part by part; a run that was stopped goes on in the part that was not finished."""
 
+import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
-from deltas_nets.config.recipes import Recipe
+from deltas_nets.atomic_files import write_json
+from deltas_nets.config.recipes import Recipe, RecipeName
+from deltas_nets.errors import UserError
+from deltas_nets.pretrained import load_model, read_metadata, save_weights
 from deltas_nets.train.checkpoint import CHECKPOINT
 from deltas_nets.train.fit import fit
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.start import Start
+
+RECORD = "recipe.json"
+
+
+class Beginning(NamedTuple):
+    """What decides the result of a recipe's command.
+
+    Attributes:
+        name: of the recipe.
+        effort: share of it.
+        init: weights that it starts from.
+        teacher: weights of its teacher.
+    """
+
+    name: RecipeName
+    effort: float
+    init: Path | None
+    teacher: Path | None
+
+    def record(self) -> dict[str, object]:
+        """As it is written: of files what is in them, not where they are."""
+        return {
+            "recipe": self.name,
+            "effort": self.effort,
+            "init": _fingerprint(self.init),
+            "teacher-weights": _fingerprint(self.teacher),
+        }
+
+
+def begin(folder: Path, beginning: Beginning) -> None:
+    """Write what a recipe begins with, or compare it with what an earlier run began with.
+
+    Raises:
+        UserError: names what differs; or the folder's record cannot be read.
+    """
+    file, record = folder / RECORD, beginning.record()
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(file, record)
+        return
+    try:
+        before = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(f"not readable ({error})", file, "name a new folder with --out") from None
+    for name, value in record.items():
+        if before.get(name) != value:
+            was = "without it" if before.get(name) is None else f"with {before[name]}"
+            option = "what was begun there" if name == "recipe" else f"--{name}"
+            raise UserError(
+                f"the recipe in this folder was begun {was}: {name}",
+                file,
+                f"give {option} as then, or name a new folder with --out",
+            )
+
+
+def _fingerprint(file: Path | None) -> str | None:
+    if file is None:
+        return None
+    with file.open("rb") as opened:
+        return f"{file.name}, SHA-256 {hashlib.file_digest(opened, 'sha256').hexdigest()}"
 
 
 def run_parts(
@@ -52,3 +118,18 @@ def run_parts(
         weights = fit(part.config, folder / part.name, start, report=report)
     assert weights is not None, "a recipe has parts"
     return weights
+
+
+def sign(weights: Path, recipe: Recipe, beginning: Beginning) -> None:
+    """Add to weights which recipe made them: a part's own record knows of no other part."""
+    parts = [
+        {
+            "name": part.name,
+            "steps": part.config.steps,
+            "seed": part.config.seed,
+            "rooms": [part.config.data.seed, part.config.data.seed + part.config.data.num_rooms],
+        }
+        for part in recipe.parts
+    ]
+    said = json.dumps(beginning.record() | {"parts": parts})
+    save_weights(weights, load_model(weights), read_metadata(weights) | {"recipe": said})

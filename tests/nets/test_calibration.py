@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from run_command import Run, assert_one_line, runner
+from run_command import Run, assert_one_line
 
 from deltas_nets import load_model
 from deltas_nets.config import DetectorConfig, NetworkConfig
@@ -364,11 +364,6 @@ def test_disturbed_rooms_keep_the_truth_and_repeat_themselves() -> None:
     moved = (once.views.cam_from_world - plain.views.cam_from_world)[1].abs()
     assert 0 < moved.max() < 0.05
     assert len(DisturbedRooms(rooms)) == 2
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    return runner(monkeypatch, capfd)
 
 
 @pytest.fixture(scope="module")

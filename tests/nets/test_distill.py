@@ -1,6 +1,8 @@
 """Distillation of the detector: the command, what it records, and where it computes."""
 
 import dataclasses
+import json
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -18,12 +20,18 @@ from torch import Tensor, nn
 from deltas_nets.config import CONFIGS
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import read_metadata, save_weights
+from deltas_nets.pretrained import load_model, read_metadata, save_weights, weights_file
 from deltas_nets.teachers import TEACHERS
 from deltas_nets.teachers.superpoint import SuperPoint
 from deltas_nets.train import distill as distill_module
 from deltas_nets.train import distill_pictures
-from deltas_nets.train.distill import DistillConfig, distill, record_of, train_detector
+from deltas_nets.train.distill import (
+    DistillConfig,
+    Learned,
+    distill,
+    record_of,
+    train_detector,
+)
 from deltas_nets.train.lessons import prepare
 
 STEPS, PICTURES, LOOKS, ADAPTATION = 3, 2, 2, 2
@@ -152,8 +160,8 @@ def test_lessons_and_training_stay_on_the_device(
     # The picture, what the student sees of it, and two homographies for each further side.
     assert len(copies) <= PICTURES * (1 + LOOKS + 2 * (ADAPTATION - 1))
     with one_device() as copies:
-        loss = train_detector(model, lessons, config)
-    assert on_device((loss, model.state_dict()))
+        learned = train_detector(model, lessons, config)
+    assert on_device((learned, model.state_dict()))
     # Which pictures, once; the table of the detector's evenly spread points in every step.
     assert Counter(copies) <= Counter({"aten::_to_copy": 1 + STEPS})
 
@@ -166,6 +174,7 @@ def test_teacher_and_student_are_moved_to_the_device(
     save_weights(start, untrained(fine_width), {})
     saved: list[Deltas] = []
     # Files hold values, and the stand-in has none.
+    monkeypatch.setattr(distill_module, "check_learned", lambda *_: None)
     monkeypatch.setattr(distill_module, "record_of", lambda *_: {})
     monkeypatch.setattr(distill_module, "save_weights", lambda _, model, __: saved.append(model))
     config = small(teacher_file, tmp_path / "a.safetensors", init=str(start))
@@ -173,6 +182,38 @@ def test_teacher_and_student_are_moved_to_the_device(
         distill(config, device=DEVICE)
     (model,) = saved
     assert on_device(model.state_dict()) and model.config.detector.fine_width == 16
+
+
+@pytest.mark.parametrize("last", [2.5, torch.inf, torch.nan])
+def test_a_training_that_diverged_writes_nothing(
+    last: float, teacher_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = Learned(torch.tensor(1.0), torch.tensor(last))
+    monkeypatch.setattr(distill_module, "train_detector", lambda *_, **__: learned)
+    config = small(teacher_file, tmp_path / "a.safetensors")
+    with pytest.raises(UserError, match="diverged"):
+        distill(config)
+    assert not config.out.exists()
+
+
+def test_the_calibration_of_other_points_is_gone(teacher_file: Path, tmp_path: Path) -> None:
+    assert "calibration" in read_metadata(weights_file("deltas-small"))
+    out = distill(small(teacher_file, tmp_path / "a.safetensors"))
+    record, said = read_metadata(out), torch.tensor([-3.0])
+    assert "calibration" not in record
+    assert torch.equal(load_model(out).calibration(said, 3), said)
+    settings = json.loads(record["detector_config"])
+    assert settings["looks"] == LOOKS and str(tmp_path) not in record["detector_config"]
+
+
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.0, "rooms"), (1.0, "photographs"), (0.3, "rooms.*photographs")]
+)
+def test_only_pictures_that_were_used_are_named(share: float, said: str) -> None:
+    config = DistillConfig("aliked", Path("w"), Path("o.safetensors"), picture_share=share)
+    data = record_of(config, {}, torch.tensor(0.5))["detector_data"]
+    assert re.search(said, data)
+    assert ("rooms" in data) == (share < 1) and ("photographs" in data) == (share > 0)
 
 
 # The command

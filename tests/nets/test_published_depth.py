@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from published_tables import Tables, formula_tensor, random_tables
-from run_command import Run, assert_one_line, runner
+from run_command import Run, assert_one_line
 from torch.testing import assert_close
 
 from deltas_geom.testing.scenes import rigid
@@ -24,12 +24,6 @@ from deltas_nets.reference import ReferenceNetwork
 
 MakeCapture = Callable[..., Path]
 SMALL = ("--work-size", 48, 64, "--views", 2)
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """Run `deltas` with arguments, in this process."""
-    return runner(monkeypatch, capfd)
 
 
 @pytest.fixture(scope="module")

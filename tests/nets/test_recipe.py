@@ -1,5 +1,6 @@
 """`deltas recipe`: parts one after the other, each from the weights of the one before."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -16,11 +17,11 @@ from deltas_nets.config import to_dict
 from deltas_nets.config.recipes import FEWEST_ROOMS, RECIPES, Part, Recipe
 from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
-from deltas_nets.pretrained import load_model, read_metadata
+from deltas_nets.pretrained import load_model, read_metadata, weights_file
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train import recipe as recipe_module
 from deltas_nets.train.checkpoint import load_config
-from deltas_nets.train.recipe import run_parts
+from deltas_nets.train.recipe import RECORD, Beginning, begin, run_parts
 from deltas_nets.train.start import Start
 
 CONFIG = replace(CONFIG_OF_FOUR, batch_size=2)
@@ -117,6 +118,9 @@ def test_the_command_trains_and_calibrates(tmp_path: Path, run: Run) -> None:
     record = read_metadata(out / "weights.safetensors")
     assert record["step"] == "2" and record["seed"] == "1"
     assert "EfficientNet-Lite0" in record["origin"] and "rooms" in record["calibration"]
+    made = json.loads(record["recipe"])
+    assert [part["steps"] for part in made["parts"]] == [1, 2]
+    assert (made["recipe"], made["effort"], made["init"]) == ("night", 1.0, None)
     said = torch.tensor([-3.0])
     assert not torch.equal(load_model(out / "weights.safetensors").calibration(said, 3), said)
     assert_one_line(run("recipe", "night", "--out", out, "--workers", 0), "finished", "weights")
@@ -132,9 +136,40 @@ def test_the_command_goes_on_from_weights(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(recipe_module, "fit", spied)
-    given = tmp_path / "given.safetensors"
-    assert run("recipe", "night", "--out", tmp_path / "run", "--init", given).code == 130
-    assert starts == [Start(init=given)]
+    out = tmp_path / "run"
+    stopped = run("recipe", "night", "--out", out, "--init", "deltas-small")
+    assert (stopped.code, stopped.err) == (130, "deltas: stopped; the same command goes on\n")
+    assert starts == [Start(init=weights_file("deltas-small"))]
+    other = run("recipe", "night", "--out", out)
+    assert_one_line(other, "begun with deltas-small.safetensors", "--init", "recipe.json")
+
+
+def test_what_differs_from_the_run_to_go_on_with_is_named(tmp_path: Path) -> None:
+    teacher, another = tmp_path / "teacher.pth", tmp_path / "another.pth"
+    teacher.write_bytes(b"1")
+    another.write_bytes(b"2")
+    first = Beginning("night", 0.5, None, teacher)
+    for _ in range(2):
+        begin(tmp_path, first)
+    moved = teacher.rename(tmp_path / "moved").rename(tmp_path / "teacher.pth")
+    begin(tmp_path, first._replace(teacher=moved))
+    for other, said in (
+        (first._replace(name="hour"), "night"),
+        (first._replace(effort=1.0), "with 0.5: effort"),
+        (first._replace(init=another), "without it: init"),
+        (first._replace(teacher=None), "with teacher.pth"),
+        (first._replace(teacher=another), "with teacher.pth"),
+    ):
+        with pytest.raises(UserError, match=said):
+            begin(tmp_path, other)
+    (tmp_path / RECORD).write_text("{")
+    with pytest.raises(UserError, match="not readable"):
+        begin(tmp_path, first)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_what_needs_a_gpu_says_so_where_there_is_none(tmp_path: Path, run: Run) -> None:
+    assert_one_line(run("recipe", "hour", "--out", tmp_path / "run"), "GPU", "use night")
 
 
 @pytest.mark.parametrize(

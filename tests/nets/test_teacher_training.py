@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
-from run_command import Run, assert_one_line, runner
+from run_command import Run, assert_one_line
 from run_fit import CONFIG, assert_same_state, finish, launch, logged, read_checkpoint, train
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -33,12 +33,6 @@ from deltas_nets.train.step import Objective
 
 TAUGHT = replace(CONFIG, steps=2, teacher="superpoint")
 ODD = (52, 68)  # rows and columns beyond the last whole cell
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """Run `deltas` with arguments, in this process."""
-    return runner(monkeypatch, capfd)
 
 
 def random_superpoint(*, batch_norm: bool) -> SuperPoint:
