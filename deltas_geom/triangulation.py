@@ -72,14 +72,16 @@ class Triangulation(NamedTuple):
         """The same without the points that a view has nearer or farther than a range.
 
         A slightly wrong match of nearly parallel rays is a point kilometres away, and valid. Where
-        one knows better, such points are no longer valid: OUT_OF_RANGE.
+        one knows better, such points are no longer valid: OUT_OF_RANGE, and 0 in every field, as
+        all that failed. After :func:`triangulate_rays` depth, and so the range, is along the rays.
 
         Args:
             depth_range: (near, far) metres, both included; far may be infinite.
-            view: whose depth counts.
+            view: whose depth counts, whether or not it saw the point.
 
         Raises:
             ValueError: the range makes no sense.
+            IndexError: there is no such view.
 
         Example:
             >>> from deltas_geom import PosedViews

@@ -66,7 +66,7 @@ _EVERYTHING_AT_ONCE = TrainConfig(
 
 _SMALL_ROOMS = TrainConfig(
     data=DataConfig(num_rooms=20_000, num_views=5, height=192, width=256, replay=6, shelf=12),
-    steps=6000,
+    steps=3000,
     sizes=((144, 192), (144, 192), (192, 256)),
     precision="bf16-mixed",
 )
@@ -75,7 +75,7 @@ _LARGE_ROOMS = TrainConfig(
     data=DataConfig(
         num_rooms=20_000, seed=30_000, num_views=7, height=288, width=384, replay=4, shelf=12
     ),
-    steps=4000,
+    steps=2500,
     sizes=((192, 256), (240, 320), (288, 384)),
     batch_size=4,
     learning_rate=8e-4,

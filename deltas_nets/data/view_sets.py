@@ -150,5 +150,5 @@ def doubtful_scale(
         return None
     return (
         f"views that go together stand {usual:.3g} m apart (median), and depth is searched from "
-        f"{near:g} to {far:g} m: are the poses in metres?"
+        f"{near:g} to {far:g} m: are the poses in metres? If not, scale their translations"
     )
