@@ -83,7 +83,12 @@ class Recipe:
             teacher=self.teacher_weights,
         )
         print(f"calibration on {recipe.calibration_rooms} rooms for each number of views")
-        Calibrate(out=finished, weights=str(weights), rooms=recipe.calibration_rooms).run()
+        Calibrate(
+            out=finished,
+            weights=str(weights),
+            rooms=recipe.calibration_rooms,
+            size=recipe.calibration_size,
+        ).run()
         sign(finished, recipe, beginning)
 
     def _workers(self) -> int:

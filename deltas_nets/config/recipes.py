@@ -29,10 +29,12 @@ class Recipe(NamedTuple):
     Attributes:
         parts: trainings.
         calibration_rooms: for each curve of the spread, which is fitted last.
+        calibration_size: height and width of their images: where the weights will work.
     """
 
     parts: tuple[Part, ...]
     calibration_rooms: int = 200
+    calibration_size: tuple[int, int] = (288, 384)
 
     def scaled(self, effort: float) -> "Recipe":
         """The same with a share of the steps and of the rooms to calibrate on, a few at least."""

@@ -31,6 +31,7 @@ SMALL = Recipe(
         Part("2-second", replace(CONFIG, steps=2, seed=1, learning_rate=1e-9)),
     ),
     calibration_rooms=FEWEST_ROOMS,
+    calibration_size=(48, 64),
 )
 FIRST, SECOND = (part.name for part in SMALL.parts)
 

@@ -283,7 +283,8 @@ def test_what_is_behind_a_mirror_is_not_mirrored() -> None:
     expected, _ = render_view(room, atlas, *camera, image_size=SIZE)
     below = room._replace(solids=cellar, surfaces=looks)
     found, _ = render_view(below, atlas, *camera, image_size=SIZE)
-    assert torch.equal(found, expected)
+    # Not to the bit: with another number of solids some processors round in another order.
+    assert_close(found, expected, rtol=0, atol=1e-5)  # a step of colour is 400 times that
 
 
 def test_reflections_do_not_stay_on_the_surface() -> None:
