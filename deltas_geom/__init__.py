@@ -36,7 +36,8 @@ from deltas_geom.sampling import Samples, sample_inv_depths, sample_map, sample_
 from deltas_geom.segments import Segments, epipolar_segments
 from deltas_geom.status import Status
 from deltas_geom.tracks import TriangulatedTracks, triangulate_tracks
-from deltas_geom.triangulation import Triangulation, triangulate, triangulate_points
+from deltas_geom.triangulated import Triangulation
+from deltas_geom.triangulation import triangulate, triangulate_points
 from deltas_geom.two_view import TwoViewTriangulation, triangulate_two_view
 from deltas_geom.uncertainty import (
     depth_variance,

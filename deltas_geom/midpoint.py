@@ -17,7 +17,7 @@ from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dt
 from deltas_geom.poses import camera_centers
 from deltas_geom.precision import without_autocast
 from deltas_geom.status import Status
-from deltas_geom.triangulation import Triangulation
+from deltas_geom.triangulated import Triangulation
 from deltas_geom.uncertainty import parallax_of
 
 _Vector = tuple[Tensor, ...]

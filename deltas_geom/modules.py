@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
 from deltas_geom.sampling import Samples, sample_segments
 from deltas_geom.segments import epipolar_segments
-from deltas_geom.triangulation import Triangulation, triangulate
+from deltas_geom.triangulated import Triangulation
+from deltas_geom.triangulation import triangulate
 from deltas_geom.views import PosedViews
 
 

@@ -35,7 +35,7 @@ from deltas_geom.rig_frame import (
     rig_frames,
 )
 from deltas_geom.status import Status
-from deltas_geom.triangulation import Triangulation
+from deltas_geom.triangulated import Triangulation
 from deltas_geom.uncertainty import parallax_of
 
 

@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_depth_range
 from deltas_geom.chunks import in_chunks, surely_all
 from deltas_geom.equations import (
     Alike,
@@ -35,6 +34,7 @@ from deltas_geom.rig_frame import (
     kept_in_world,
 )
 from deltas_geom.status import Status
+from deltas_geom.triangulated import Triangulation
 from deltas_geom.uncertainty import (
     covariance_of,
     in_views,
@@ -43,73 +43,6 @@ from deltas_geom.uncertainty import (
     residual_of,
     unpacked3,
 )
-
-
-class Triangulation(NamedTuple):
-    """Triangulated points and what is known about them.
-
-    Attributes:
-        points: ``(*B, N, 3)`` in the world, metres; (0, 0, 0) with zero gradient if not valid.
-        depth: ``(*B, V, N)`` along each camera's z axis, metres; 0 if not valid.
-        status: ``(*B, N)`` int8 of :class:`Status`.
-        valid: ``(*B, N)`` bool, status is OK.
-        residual: ``(*B, N)`` weighted RMS distance of the projections from the pixels, px.
-        parallax: ``(*B, N)`` largest angle between rays of used views, rad.
-        covariance: ``(*B, N, 3, 3)`` for pixel noise of standard deviation 1 / weight px, m^2;
-            None unless asked for. It is that of the least reprojection error, which one step of
-            :func:`refine_points` reaches; points of the linear solution scatter a little more.
-    """
-
-    points: Tensor
-    depth: Tensor
-    status: Tensor
-    valid: Tensor
-    residual: Tensor
-    parallax: Tensor
-    covariance: Tensor | None
-
-    def within_depth(self, depth_range: tuple[float, float], *, view: int = 0) -> "Triangulation":
-        """The same without the points that a view has nearer or farther than a range.
-
-        A slightly wrong match of nearly parallel rays is a point kilometres away, and valid. Where
-        one knows better, such points are no longer valid: OUT_OF_RANGE, and 0 in every field, as
-        all that failed. After :func:`triangulate_rays` depth, and so the range, is along the rays.
-
-        Args:
-            depth_range: (near, far) metres, both included; far may be infinite.
-            view: whose depth counts, whether or not it saw the point.
-
-        Raises:
-            ValueError: the range makes no sense.
-            IndexError: there is no such view.
-
-        Example:
-            >>> from deltas_geom import PosedViews
-            >>> proj = PosedViews(torch.eye(3).expand(2, 3, 3), torch.eye(4).repeat(2, 1, 1)).proj
-            >>> proj[1, 0, 3] = -1.0  # one metre to the right
-            >>> pixels = torch.tensor([[[0.0, 0.0], [0.0, 0.0]], [[-0.5, 0.0], [-0.001, 0.0]]])
-            >>> near_and_far = triangulate(proj, pixels)
-            >>> near_and_far.within_depth((0.5, 100.0)).depth[0]
-            tensor([2., 0.])
-        """
-        check_depth_range(depth_range)
-        near, far = depth_range
-        depth = self.depth[..., view, :]
-        outside = self.valid & ((depth < near) | (depth > far))
-        covariance = self.covariance
-        return Triangulation(
-            points=torch.where(outside[..., None], 0.0, self.points),
-            depth=torch.where(outside[..., None, :], 0.0, self.depth),
-            status=torch.where(outside, Status.OUT_OF_RANGE.value, self.status),
-            valid=self.valid & ~outside,
-            residual=torch.where(outside, 0.0, self.residual),
-            parallax=torch.where(outside, 0.0, self.parallax),
-            covariance=(
-                None
-                if covariance is None
-                else torch.where(outside[..., None, None], 0.0, covariance)
-            ),
-        )
 
 
 @without_autocast

@@ -17,6 +17,7 @@ ORDER = [
     "pixels",
     "poses",
     "status",
+    "triangulated",
     "views",
     "projection",
     "fundamental",

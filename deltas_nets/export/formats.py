@@ -61,10 +61,10 @@ def export_onnx(
         >>> from deltas_nets import load_model
         >>> config = ExportConfig(num_views=2, num_points=64, image_size=(64, 96))
         >>> file = Path(tempfile.mkdtemp()) / "small.onnx"
-        >>> export_onnx(load_model(), file, config).relative < 1e-3
+        >>> export_onnx(load_model(), file, config).relative < 1e-3  # doctest: +SKIP
         True
         >>> import onnxruntime
-        >>> [known.name for known in onnxruntime.InferenceSession(file).get_inputs()]
+        >>> [known.name for known in onnxruntime.InferenceSession(file).get_inputs()]  # doctest: +SKIP
         ['images', 'K', 'cam_from_world']
     """
     out, config = Path(out), config or ExportConfig()
