@@ -64,7 +64,8 @@ def export_onnx(
         >>> export_onnx(load_model(), file, config).relative < 1e-3  # doctest: +SKIP
         True
         >>> import onnxruntime
-        >>> [known.name for known in onnxruntime.InferenceSession(file).get_inputs()]  # doctest: +SKIP
+        >>> session = onnxruntime.InferenceSession(file)  # doctest: +SKIP
+        >>> [known.name for known in session.get_inputs()]  # doctest: +SKIP
         ['images', 'K', 'cam_from_world']
     """
     out, config = Path(out), config or ExportConfig()
