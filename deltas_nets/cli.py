@@ -206,7 +206,7 @@ def _how_to_go_on(command: Command) -> str:
         case Train():
             return "the same command with --resume goes on"
         case _:
-            return "nothing was written"
+            return "start it again"
 
 
 def _help_of(arguments: list[str]) -> str:

@@ -48,7 +48,8 @@ class Recipe:
         from deltas_nets.checked_inputs import encoder_file
         from deltas_nets.cli_calibrate import Calibrate
         from deltas_nets.outputs import check_writable
-        from deltas_nets.pretrained import weights_file
+        from deltas_nets.pretrained import load_model, weights_file
+        from deltas_nets.teachers import load_teacher
         from deltas_nets.train.recipe import Beginning, begin, run_parts, sign
 
         if int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -62,8 +63,12 @@ class Recipe:
             raise UserError(what, "command line", "use night")
         workers = self._workers()
         init = None if self.init is None else weights_file(self.init)
-        if self.teacher_weights is not None and not self.teacher_weights.is_file():
-            raise UserError("no such file", self.teacher_weights, "name ALIKED's weights")
+        encoder = encoder_file("pretrained") if init is None else None
+        # Looked into before the folder remembers what it was begun with.
+        if init is not None:
+            load_model(init)
+        if self.teacher_weights is not None:
+            load_teacher("aliked", self.teacher_weights)
         finished = self.out / "weights.safetensors"
         if finished.exists():
             raise UserError(
@@ -78,7 +83,7 @@ class Recipe:
         weights = run_parts(
             recipe,
             self.out,
-            encoder=encoder_file("pretrained") if init is None else None,
+            encoder=encoder,
             init=init,
             teacher=self.teacher_weights,
         )

@@ -88,7 +88,7 @@ _LARGE_ROOMS = TrainConfig(
 )
 
 RECIPES: dict[RecipeName, Recipe] = {
-    # Small images teach what a match is for a tenth of the work; large ones are what it is for.
+    # Small images teach what a match is for half of the work; large ones are what it is for.
     "night": Recipe((Part("1-small-rooms", _SMALL_ROOMS), Part("2-large-rooms", _LARGE_ROOMS))),
     "hour": Recipe((Part("1-rooms", _EVERYTHING_AT_ONCE),)),
 }

@@ -11,6 +11,7 @@ import torch
 from run_command import Run, assert_one_line, runner
 from run_fit import CONFIG as CONFIG_OF_FOUR
 from run_fit import logged
+from safetensors.torch import save_file
 from torch import Tensor
 
 from deltas_nets.config import to_dict
@@ -189,6 +190,17 @@ def test_nonsense_is_refused_before_anything_is_written(
     out = tmp_path / "run"
     assert_one_line(run("recipe", "night", "--out", out, "--workers", 0, *arguments), said)
     assert not out.exists() or not any(out.iterdir())
+
+
+def test_files_of_another_kind_are_refused_before_the_folder_remembers_them(
+    tmp_path: Path, run: Run
+) -> None:
+    wrong = tmp_path / "wrong.safetensors"
+    save_file({"weight": torch.zeros(1)}, wrong)
+    for option in ("--teacher-weights", "--init"):
+        out = tmp_path / option
+        assert_one_line(run("recipe", "night", "--out", out, option, wrong), "wrong.safetensors")
+        assert not (out / RECORD).exists()
 
 
 @pytest.mark.parametrize("name", RECIPES)
