@@ -13,7 +13,7 @@ from deltas_nets.config.checks import check_at_least, check_positive, check_seed
 class DistillConfig:
     """Train the detector head of a network to find a teacher's points."""
 
-    teacher: Literal["superpoint", "aliked", "disk", "xfeat"]
+    teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"]
     """Whose points are wanted."""
     teacher_weights: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The teacher's published weights."""

@@ -42,7 +42,9 @@ class Recipe(NamedTuple):
         rooms = min(500, round(effort * self.calibration_rooms))
         return scaled._replace(calibration_rooms=max(FEWEST_ROOMS, rooms))
 
-    def taught_by(self, teacher: Literal["superpoint", "aliked", "disk", "xfeat"]) -> "Recipe":
+    def taught_by(
+        self, teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"]
+    ) -> "Recipe":
         """The same with another detector's interest points to learn."""
         return self._each(lambda c: replace(c, teacher=teacher))
 

@@ -133,7 +133,7 @@ class TrainConfig:
     """Most views per step."""
     num_keypoints: int = 320
     """Points per image in training."""
-    teacher: Literal["superpoint", "aliked", "disk", "xfeat"] | None = None
+    teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"] | None = None
     """Whose interest points the detector learns to find (the paper: SuperPoint's), with weights
     from --teacher-weights; Shi-Tomasi corners without one."""
     pose_noise: tuple[float, float] = (0.004, 0.0015)

@@ -11,12 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from deltas_nets.network.layers import WideConv1d, WideLinear, zero_initialised
+from deltas_nets.network.layers import WideLinear, WideRowConv, zero_initialised
 
 WIDTH = 64
 """Channels of a point's embedding."""
 # A neighbour's posterior never rules out a depth altogether.
 _FLOOR = 3e-3
+_FAINT = 1e-30
 
 
 class Exchanged(NamedTuple):
@@ -57,10 +58,9 @@ class Context(nn.Module):
         peak = probability.amax(dim=-1)
         state = torch.stack([entropy, peak], dim=-1)
         points = self.embed(torch.cat([features, state, positions], dim=-1))
-        squared = torch.cdist(positions, positions).square()
         stages = [logits]
         for exchange in self.rounds:
-            stages.append(exchange(stages[-1], points, squared))
+            stages.append(exchange(stages[-1], points, positions))
         return Exchanged(stages, points)
 
 
@@ -76,30 +76,40 @@ class _Round(nn.Module):
         self.gain = nn.Parameter(torch.full((heads,), gain))
         self.mix = smooth_scores(1 + heads)
 
-    def forward(self, logits: Tensor, points: Tensor, squared: Tensor) -> Tensor:
-        batch, count, samples = logits.shape
-        query = self.query(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
-        key = self.key(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
-        attention = query @ key.mT / 4
-        attention = attention - squared[:, None] * torch.exp(-2 * self.log_reach)[:, None, None]
-        attention = attention + self.trust(points).mT[:, :, None, :]
-        # A point must not confirm itself.
-        itself = torch.eye(count, dtype=torch.bool, device=logits.device)
-        attention = attention.masked_fill(itself, -1e4).softmax(dim=-1)
-        told = attention @ logits.softmax(dim=-1)[:, None]  # (B, heads, N, S)
-        evidence = (told + _FLOOR).log() - math.log(_FLOOR)
-        rows = torch.cat([logits[:, None] / 10, evidence], dim=1)
-        rows = rows.transpose(1, 2).reshape(batch * count, 1 + self.heads, samples)
-        correction = self.mix(rows).view(batch, count, samples)
+    def forward(self, logits: Tensor, points: Tensor, positions: Tensor) -> Tensor:
+        attention = self._attention(points, positions)
+        # Processors take many times as long for products of numbers below the least normal one.
+        told = (attention.flatten(1, 2) + _FAINT) @ logits.softmax(dim=-1)
+        evidence = (told.view(*attention.shape[:-1], -1) + _FLOOR).log() - math.log(_FLOOR)
+        correction = self.mix(torch.cat([logits[:, None] / 10, evidence], dim=1)).squeeze(1)
         told_in_all = (self.gain[:, None, None] * evidence).sum(dim=1)
         updated: Tensor = logits + told_in_all + 4 * correction
         return updated
+
+    def _attention(self, points: Tensor, positions: Tensor) -> Tensor:
+        """How much each point listens to each other, ``(B, heads, N, N)``; the rows' sums are 1.
+
+        The softmax of q k / 4 - |x - y|^2 / reach^2 + trust. All of it is one product: the square
+        is written out, and what a row has in common is left out, for a softmax does not see it.
+        """
+        query = self.query(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
+        key = self.key(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
+        trust = self.trust(points).mT.unsqueeze(-1)
+        places = (positions - 0.5)[:, None].expand(*query.shape[:-1], 2)
+        fall = torch.exp(-2 * self.log_reach)[:, None, None].expand_as(trust)
+        query = torch.cat([query / 4, 2 * fall * places, -fall, torch.ones_like(trust)], dim=-1)
+        squares = places.square().sum(dim=-1, keepdim=True)
+        key = torch.cat([key, places, squares, trust], dim=-1)
+        # A point must not confirm itself.
+        itself = torch.eye(query.shape[-2], dtype=query.dtype, device=query.device)
+        product = torch.baddbmm(-1e4 * itself, query.flatten(0, 1), key.flatten(0, 1).mT)
+        return product.view(*query.shape[:-1], -1).softmax(dim=-1)
 
 
 def smooth_scores(inputs: int) -> nn.Sequential:
     """A correction of scores by their neighbours along the samples; it starts as none."""
     return nn.Sequential(
-        WideConv1d(inputs, 12, 5, padding=2),
+        WideRowConv(inputs, 12, 5, padding=2),
         nn.ReLU(),
-        zero_initialised(WideConv1d(12, 1, 5, padding=2)),
+        zero_initialised(WideRowConv(12, 1, 5, padding=2)),
     )

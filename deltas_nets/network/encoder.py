@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_nets.errors import UserError
+from deltas_nets.network.conv_norm import SameConv, conv_norm
 from deltas_nets.network.layers import ConvBlock
 
 
@@ -67,17 +68,8 @@ _STAGES = (
 _TAPS = (0, 2, 4, 10)  # the last block at each stride
 
 
-class _SameConv(nn.Conv2d):
-    """Convolution padded as TensorFlow does ("same"), which the pretrained weights expect."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        kernel, stride = self.kernel_size[0], self.stride[0]
-        height, width = input.shape[-2:]
-        pad_y = max((-(-height // stride) - 1) * stride + kernel - height, 0)
-        pad_x = max((-(-width // stride) - 1) * stride + kernel - width, 0)
-        padding = (pad_x // 2, pad_x - pad_x // 2, pad_y // 2, pad_y - pad_y // 2)
-        padded = F.pad(input, padding) if pad_x or pad_y else input
-        return F.conv2d(padded, self.weight, self.bias, self.stride, 0, 1, self.groups)
+def _relu6(x: Tensor) -> Tensor:
+    return F.relu6(x, inplace=True)
 
 
 def _batch_norm(channels: int) -> nn.BatchNorm2d:
@@ -91,17 +83,17 @@ class _InvertedResidual(nn.Module):
         self.expands = expand != 1
         self.residual = stride == 1 and inputs == outputs
         if self.expands:
-            self._expand_conv = _SameConv(inputs, width, 1, bias=False)
+            self._expand_conv = SameConv(inputs, width, 1, bias=False)
             self._bn0 = _batch_norm(width)
-        self._depthwise_conv = _SameConv(width, width, kernel, stride, groups=width, bias=False)
+        self._depthwise_conv = SameConv(width, width, kernel, stride, groups=width, bias=False)
         self._bn1 = _batch_norm(width)
-        self._project_conv = _SameConv(width, outputs, 1, bias=False)
+        self._project_conv = SameConv(width, outputs, 1, bias=False)
         self._bn2 = _batch_norm(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        y = F.relu6(self._bn0(self._expand_conv(x))) if self.expands else x
-        y = F.relu6(self._bn1(self._depthwise_conv(y)))
-        y = self._bn2(self._project_conv(y))
+        y = _relu6(conv_norm(x, self._expand_conv, self._bn0)) if self.expands else x
+        y = _relu6(conv_norm(y, self._depthwise_conv, self._bn1))
+        y = conv_norm(y, self._project_conv, self._bn2)
         output: Tensor = x + y if self.residual else y
         return output
 
@@ -111,7 +103,7 @@ class Encoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self._conv_stem = _SameConv(3, 32, 3, 2, bias=False)
+        self._conv_stem = SameConv(3, 32, 3, 2, bias=False)
         self._bn0 = _batch_norm(32)
         blocks: list[nn.Module] = []
         channels = 32
@@ -128,7 +120,7 @@ class Encoder(nn.Module):
         batch = images.shape[:2]
         flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         # The mean and range that the pretrained weights were trained with.
-        x = F.relu6(self._bn0(self._conv_stem((flat - 0.498) / 0.502)))
+        x = _relu6(conv_norm((flat - 0.498) / 0.502, self._conv_stem, self._bn0))
         taps = [self.fine(flat)]
         for number, block in enumerate(self._blocks):
             x = block(x)

@@ -4,6 +4,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom.precision import promoted
+from deltas_nets.network.conv_norm import conv_norm
 
 
 class ConvBlock(nn.Sequential):
@@ -15,6 +16,12 @@ class ConvBlock(nn.Sequential):
             nn.BatchNorm2d(outputs),
             nn.ReLU(inplace=True),
         )
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(B, inputs, H, W)`` to ``(B, outputs, H / stride, W / stride)``."""
+        conv, norm, _ = self
+        assert isinstance(conv, nn.Conv2d)
+        return F.relu(conv_norm(input, conv, norm), inplace=True)
 
 
 class WideLinear(nn.Linear):
@@ -28,14 +35,15 @@ class WideLinear(nn.Linear):
         return F.linear(*promoted(input, self.weight, self.bias))
 
 
-class WideConv1d(nn.Conv1d):
-    """A convolution with a bias, likewise."""
+class WideRowConv(nn.Conv1d):
+    """A convolution with a bias along the rows of maps, likewise."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """``(B, inputs, S)`` to ``(B, outputs, S)``."""
-        assert self.bias is not None
-        output: Tensor = self._conv_forward(*promoted(input, self.weight, self.bias))
-        return output
+        """``(B, inputs, N, S)`` to ``(B, outputs, N, S)``: all N rows of S by the same kernel."""
+        assert self.bias is not None and isinstance(self.padding, tuple)
+        input, weight, bias = promoted(input, self.weight, self.bias)
+        # In two dims: as N images of one row, the same takes twice as long.
+        return F.conv2d(input, weight.unsqueeze(-2), bias, padding=(0, *self.padding))
 
 
 class WideBatchNorm1d(nn.BatchNorm1d):

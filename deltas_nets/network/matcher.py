@@ -130,8 +130,7 @@ class JointMatcher(nn.Module):
         correlation = correlate(anchor, descriptors.maps[:, 1:], samples, image_size=image_size)
         seen = samples.mask.squeeze(-2)
         bins = best_of_bins(*self._fused(correlation.squeeze(-2), seen), places, centres)
-        rows = torch.stack([bins.score, bins.share], dim=2).flatten(0, 1)
-        fused = bins.score + self.smooth(rows).view_as(bins.score)
+        fused = bins.score + self.smooth(torch.stack([bins.score, bins.share], dim=1)).squeeze(1)
         context = sample_map(descriptors.context[:, 0], keypoints, image_size=image_size)
         stages, embedding = self.context(
             fused * self.log_scale.exp(),

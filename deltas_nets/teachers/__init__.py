@@ -1,4 +1,4 @@
-"""Detectors to distil from: score maps of networks that others trained.
+"""Detectors to distil from: score maps of networks that others trained, or we did.
 
 A teacher is used in training only; nothing of it is in the shipped weights but what the student
 learned. The paper's teacher is SuperPoint.
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from deltas_nets.errors import UserError
 from deltas_nets.teachers.kornia_detectors import load_aliked, load_disk, load_xfeat
+from deltas_nets.teachers.own_detector import load_own
 from deltas_nets.teachers.superpoint import load_superpoint
 
 __all__ = ["LICENCES", "TEACHERS", "Teacher", "load_teacher"]
@@ -30,6 +31,7 @@ TEACHERS: dict[str, Callable[[Path], nn.Module]] = {
     "aliked": load_aliked,
     "disk": load_disk,
     "xfeat": load_xfeat,
+    "deltas": load_own,
 }
 """What loads a teacher from a file, by name."""
 
@@ -38,6 +40,7 @@ LICENCES = {
     "aliked": "BSD-3-Clause",
     "disk": "Apache-2.0",
     "xfeat": "Apache-2.0",
+    "deltas": "as the teacher's own weights say",
 }
 """Licences of the published weights, recorded beside what was distilled from them."""
 
@@ -46,7 +49,7 @@ def load_teacher(name: str, file: str | Path) -> nn.Module:
     """A :class:`Teacher` with the weights of a file, in evaluation mode.
 
     Args:
-        name: superpoint, aliked, disk or xfeat.
+        name: superpoint, aliked, disk, xfeat or deltas, a network of ours.
         file: its published weights.
 
     Raises:

@@ -20,7 +20,7 @@ from deltas_nets.config import CONFIGS, LossConfig, NetworkConfig
 from deltas_nets.losses import training_losses
 from deltas_nets.network.calibration import VIEWS, Curve, SpreadCalibration
 from deltas_nets.network.deltas import Deltas, DepthPrediction
-from deltas_nets.network.layers import WideBatchNorm1d, WideConv1d, WideLinear
+from deltas_nets.network.layers import WideBatchNorm1d, WideLinear, WideRowConv
 
 IMAGES = torch.rand(2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
 
@@ -189,7 +189,7 @@ def test_losses_of_a_double_network_take_images_in_single(model: Deltas) -> None
 
 WIDE_LAYERS: dict[str, Callable[[], nn.Module]] = {
     "linear": lambda: WideLinear(4, 3),
-    "convolution": lambda: WideConv1d(4, 3, 5, padding=2),
+    "convolution": lambda: WideRowConv(4, 3, 5, padding=2),
     "batch norm": lambda: WideBatchNorm1d(4),
 }
 
@@ -199,7 +199,9 @@ WIDE_LAYERS: dict[str, Callable[[], nn.Module]] = {
 def test_wide_layers_are_the_same_layers_with_their_weights_promoted(
     name: str, narrow: torch.dtype
 ) -> None:
-    given = torch.randn(6, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    random = torch.Generator().manual_seed(0)
+    shape = (6, 4, 2, 4) if name == "convolution" else (6, 4, 4)
+    given = torch.randn(shape, generator=random, dtype=torch.float64)
     torch.manual_seed(0)
     kept = WIDE_LAYERS[name]().to(narrow)
     widened = copy.deepcopy(kept).double()

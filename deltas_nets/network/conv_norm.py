@@ -1,0 +1,54 @@
+"""A convolution and the batch norm after it, as one convolution where the statistics stand still.
+
+A map of 96 channels is large, and a norm of its own reads and writes all of it; weights are small.
+Gradients are those of the two, so that a network may be trained with frozen statistics as well.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from deltas_geom.precision import at_least_single
+
+
+def conv_norm(x: Tensor, conv: nn.Conv2d, norm: nn.Module) -> Tensor:
+    """``norm(conv(x))``.
+
+    Args:
+        x: ``(B, C, H, W)``.
+        conv: without bias.
+        norm: batch norm of the convolution's channels, shared between processes or not.
+    """
+    if norm.training:
+        normed: Tensor = norm(conv(x))
+        return normed
+    assert isinstance(norm, nn.BatchNorm2d | nn.SyncBatchNorm)
+    assert norm.running_mean is not None and norm.running_var is not None and conv.bias is None
+    variance, mean = at_least_single(norm.running_var), at_least_single(norm.running_mean)
+    slope = norm.weight * torch.rsqrt(variance + norm.eps)
+    weight = (conv.weight * slope[:, None, None, None]).to(conv.weight.dtype)
+    shift = (norm.bias - mean * slope).to(conv.weight.dtype)
+    folded: Tensor = conv._conv_forward(x, weight, shift)
+    return folded
+
+
+class SameConv(nn.Conv2d):
+    """Convolution padded as TensorFlow does ("same"), which pretrained weights may expect.
+
+    An uneven rim is padded at the kernel: a zero before it and an even rim are the same, and the
+    map need not be copied.
+    """
+
+    def _conv_forward(self, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        rim_y, before_y = self._rim(input.shape[-2], axis=0)
+        rim_x, before_x = self._rim(input.shape[-1], axis=1)
+        if before_x or before_y:
+            weight = F.pad(weight, (before_x, 0, before_y, 0))
+        return F.conv2d(input, weight, bias, self.stride, (rim_y, rim_x), 1, self.groups)
+
+    def _rim(self, size: int, *, axis: int) -> tuple[int, int]:
+        """Rows that the map lacks at its end, and how many fewer it lacks at its start."""
+        kernel, stride = self.kernel_size[axis], self.stride[axis]
+        missing = max((-(-size // stride) - 1) * stride + kernel - size, 0)
+        after = missing - missing // 2
+        return after, after - missing // 2
