@@ -40,7 +40,7 @@ Detect = Callable[[Tensor], Tensor]  # image (3, H, W) to points (N, 2)
 
 @dataclass(frozen=True)
 class Options:
-    """Print repeatability in percent, and the mean error of repeated points in pixels."""
+    """Print shares of repeated points and of pairs, and the mean error of repeated points, px."""
 
     capture: Path
     """Folder with images, poses and depth."""
@@ -168,13 +168,14 @@ def main() -> None:
         f"{options.num_points} points, {options.tolerance} px, suppression {options.nms_radius} px"
     )
     print(f"torch {torch.__version__}, kornia {kornia.__version__}, skimage {skimage.__version__}")
-    print(f"{'':48}{'repeated %':>11}{'error px':>10}{'points':>8}")
+    print(f"{'':48}{'repeated %':>11}{'one to one %':>14}{'error px':>10}{'points':>8}")
     for name, scores in pairs.items():
         total = pooled(scores)
         mean = sum(len(found) for (of, _), found in points.items() if of == name) / sum(
             of == name for of, _ in points
         )
-        print(f"{name:48}{100 * total.share:11.1f}{total.error:10.2f}{mean:8.0f}")
+        shares = f"{100 * total.share:11.1f}{100 * total.one_to_one:14.1f}"
+        print(f"{name:48}{shares}{total.error:10.2f}{mean:8.0f}")
 
 
 if __name__ == "__main__":

@@ -69,8 +69,17 @@ def check_index(**named: Tensor) -> None:
 
 
 def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:
-    """The shape to which leading batch dims broadcast."""
-    return torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
+    """The shape to which leading batch dims broadcast; raise ``ShapeError`` where they do not."""
+    if torch.compiler.is_compiling():
+        return torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
+    # Its first call imports a computer algebra system, which takes half a second.
+    most = max(map(len, shapes), default=0)
+    aligned = [(1,) * (most - len(shape)) + tuple(shape) for shape in shapes]
+    wanted = [{*sizes} - {1} for sizes in zip(*aligned, strict=True)]
+    if any(len(sizes) > 1 for sizes in wanted):
+        listed = ", ".join(str(tuple(shape)) for shape in shapes)
+        raise ShapeError(f"leading batch dims must broadcast, got {listed}")
+    return torch.Size(next(iter(sizes)) if sizes else 1 for sizes in wanted)
 
 
 def check_depth_range(depth_range: tuple[float, float]) -> None:

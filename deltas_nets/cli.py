@@ -118,6 +118,7 @@ class Depth(Prediction):
                 "network": network_record(network),
                 "weights": file_record(self.weights, network),
                 "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
+                "precision": self.precision,
                 "views": self.views,
                 "view_sets": view_sets,
             },

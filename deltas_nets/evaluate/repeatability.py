@@ -2,20 +2,25 @@
 
 A point of one view counts if the other view sees its place: its depth is known, it projects into
 the other image, and what is seen there has the depth that the point should have. It is repeated
-if a point of the other view that counts too lies within some pixels of its projection. The
-repeatability of a pair is symmetric:
+if a point of the other view that counts too lies within some pixels of its projection. Two shares
+are in use, both symmetric:
 
-    (repeated points of the first + repeated points of the second) / (points that count)
+    repeated    (repeated points of the first + of the second) / (points that count)
+    one to one  pairs, every point with one partner / (points that count in the view of fewer)
+
+The first lets many points have the same partner, so it prefers points in clusters.
 
 Sources: Schmid, Mohr and Bauckhage, Evaluation of interest point detectors (2000), for points of
-the common part of the scene; DeTone et al., SuperPoint (2018), appendix, for the symmetric share
-and for 3 px and 300 points. They relate images by homographies, we by depth and pose.
+the common part of the scene; DeTone et al., SuperPoint (2018), appendix, for the first share and
+for 3 px and 300 points; Mikolajczyk et al., A comparison of affine region detectors (2005), section
+4.1, for the second. They relate images by homographies, we by depth and pose.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from kornia.geometry.subpix import nms2d
 from torch import Tensor
 
@@ -35,16 +40,25 @@ class Repeatability(NamedTuple):
         repeated: points of either view with a partner in the other.
         counted: points of either view whose place the other view sees.
         error: mean distance between projection and partner of repeated points, px; NaN if none.
+        paired: pairs of points that have each other for their one partner, the nearest pairs first.
+        fewer: points that count of the view that has fewer of them.
     """
 
     repeated: int
     counted: int
     error: float
+    paired: int
+    fewer: int
 
     @property
     def share(self) -> float:
         """Repeated of counted points, in [0, 1]; NaN where nothing counts."""
         return self.repeated / self.counted if self.counted else float("nan")
+
+    @property
+    def one_to_one(self) -> float:
+        """Pairs of the points that could be paired, in [0, 1]; NaN where a view has none."""
+        return self.paired / self.fewer if self.fewer else float("nan")
 
 
 class _Seen(NamedTuple):
@@ -85,14 +99,17 @@ def repeatability(
     check_shapes(depth=(depth, "2 H W"), first=(first, "N 2"), second=(second, "M 2"))
     forth = _seen_by_other(views, depth, first, depth_tolerance)
     back = _seen_by_other(views.select([1, 0]), depth.flip(0), second, depth_tolerance)
-    distances = torch.cat(
-        [
-            _to_partner(forth.pixels[forth.counts], second[back.counts]),
-            _to_partner(back.pixels[back.counts], first[forth.counts]),
-        ]
+    in_second = _distances(forth.pixels[forth.counts], second[back.counts])
+    in_first = _distances(back.pixels[back.counts], first[forth.counts])
+    nearest = torch.cat([_nearest(in_second), _nearest(in_first)])
+    near = nearest[nearest <= tolerance]
+    return Repeatability(
+        len(near),
+        len(nearest),
+        float(near.mean()),
+        _count_pairs(in_second.maximum(in_first.mT), tolerance),
+        min(in_second.shape),
     )
-    near = distances[distances <= tolerance]
-    return Repeatability(len(near), len(distances), float(near.mean()))
 
 
 def pooled(pairs: Sequence[Repeatability]) -> Repeatability:
@@ -100,7 +117,13 @@ def pooled(pairs: Sequence[Repeatability]) -> Repeatability:
     repeated = sum(pair.repeated for pair in pairs)
     total = sum(pair.error * pair.repeated for pair in pairs if pair.repeated)
     error = total / repeated if repeated else float("nan")
-    return Repeatability(repeated, sum(pair.counted for pair in pairs), error)
+    return Repeatability(
+        repeated,
+        sum(pair.counted for pair in pairs),
+        error,
+        sum(pair.paired for pair in pairs),
+        sum(pair.fewer for pair in pairs),
+    )
 
 
 def strongest_points(
@@ -146,8 +169,23 @@ def _seen_by_other(
     return _Seen(there, (own > 0) & in_image(there, image_size=size) & same)
 
 
-def _to_partner(projected: Tensor, found: Tensor) -> Tensor:
-    """Distance ``(n,)`` of each projection to the nearest found point; infinite without any."""
-    if len(found) == 0:
-        return projected.new_full((len(projected),), torch.inf)
-    return torch.cdist(projected, found, compute_mode="donot_use_mm_for_euclid_dist").amin(dim=1)
+def _distances(projected: Tensor, found: Tensor) -> Tensor:
+    """From each projection to each found point, ``(n, m)`` px."""
+    return torch.cdist(projected, found, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _nearest(distances: Tensor) -> Tensor:
+    """``(n,)`` of ``(n, m)``; infinite without any."""
+    return F.pad(distances, (0, 1), value=torch.inf).amin(dim=1)
+
+
+def _count_pairs(distances: Tensor, tolerance: float) -> int:
+    """How many pairs can be made one after the other, the nearest first, each point once."""
+    rows, columns = torch.nonzero(distances <= tolerance, as_tuple=True)
+    order = distances[rows, columns].argsort(stable=True)
+    taken: tuple[set[int], set[int]] = (set(), set())
+    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+        if row not in taken[0] and column not in taken[1]:
+            taken[0].add(row)
+            taken[1].add(column)
+    return len(taken[0])

@@ -1,7 +1,12 @@
 """Every shape error says what was expected and what was given."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deltas_geom import ShapeError
 from deltas_geom.checks import (
@@ -35,6 +40,30 @@ def test_leading_dims_are_free() -> None:
 
 def test_batch_dims_broadcast() -> None:
     assert batch_shape((2, 1), (3,), ()) == (2, 3)
+
+
+@given(shapes=st.lists(st.lists(st.integers(0, 3), max_size=4).map(tuple), max_size=4))
+def test_batch_dims_broadcast_as_those_of_torch(shapes: list[tuple[int, ...]]) -> None:
+    try:
+        wanted = torch.broadcast_shapes(*shapes)
+    except RuntimeError:
+        with pytest.raises(ShapeError, match="must broadcast"):
+            batch_shape(*shapes)
+    else:
+        assert batch_shape(*shapes) == wanted
+
+
+def test_the_first_call_imports_nothing_large() -> None:
+    # torch.broadcast_shapes, for one, imports sympy, for half a second.
+    code = """
+import sys, torch
+from deltas_geom import PosedViews, sample_inv_depths, triangulate_points
+views = PosedViews(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4))
+sample_inv_depths(views, torch.zeros(5, 2), torch.ones(3), image_size=(4, 4))
+triangulate_points(views.proj, torch.zeros(2, 5, 2))
+sys.exit('sympy' in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("depth_range", [(0, 1), (2, 1), (-1, 1), (1, 1), (float("nan"), 1)])

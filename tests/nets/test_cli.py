@@ -84,6 +84,21 @@ def test_a_stopped_run_is_continued_and_another_refused(
     assert run(*other, "--overwrite").code == 0
 
 
+def test_bfloat16_is_nearly_as_exact_and_another_setting(
+    run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
+) -> None:
+    capture = make_capture()
+    command = ["depth", capture, "--views", 2, "--weights", weights, "--out"]
+    assert run(*command, tmp_path / "whole").code == 0
+    assert run(*command, tmp_path / "half", "--precision", "bfloat16").code == 0
+    whole, half = (
+        read_depth_png(tmp_path / name / "depth" / "1.png") for name in ("whole", "half")
+    )
+    assert 0 < np.median(np.abs(half / whole - 1)) < 0.03
+    said = run(*command, tmp_path / "half")
+    assert_one_line(said, 'precision was "bfloat16", is "float32"', "--overwrite")
+
+
 def test_another_capture_with_the_same_ids_is_not_taken_for_finished(
     run: Run, make_capture: MakeCapture, weights: Path, tmp_path: Path
 ) -> None:

@@ -120,6 +120,7 @@ def test_what_it_cannot_do_is_one_line_and_nothing_is_written(
     assert_one_line(run(*base, "--work-size", 50, 64), "multiples of 8", "leave it out to use 240")
     assert_one_line(run(*base, "--min-confidence", 0.5), "states no confidence")
     assert_one_line(run("demo", "--weights", checkpoint, "--out", out), "use deltas depth")
+    assert_one_line(run(*base, "--precision", "bfloat16"), "float32 alone", "leave it out")
     assert not out.exists()
 
 

@@ -6,6 +6,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import maximum_bipartite_matching
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -91,6 +93,41 @@ def test_it_does_not_matter_which_view_is_first(shift: int, seed: int) -> None:
     forth = repeatability(views, wall(), first, second)
     back = repeatability(views.select([1, 0]), wall(), second, first)
     assert (forth.repeated, forth.counted) == (back.repeated, back.counted)
+    assert (forth.paired, forth.fewer) == (back.paired, back.fewer)
+
+
+@given(shift=st.integers(-15, 15), seed=st.integers(0, 20))
+def test_pairs_are_fewer_than_the_most_that_can_be_made_and_at_least_half(
+    shift: int, seed: int
+) -> None:
+    # Greedy pairs cannot be extended, and every one of them stands in the way of two at most.
+    random = torch.Generator().manual_seed(seed)
+    first = torch.rand(60, 2, generator=random) * torch.tensor([79.0, 59])
+    second = first[:50] - torch.tensor([float(shift), 0]) + 2 * torch.rand(50, 2, generator=random)
+    score = repeatability(row_of_two(shift), wall(), first, second)
+    moved = first - torch.tensor([float(shift), 0])
+    inside = (moved[:, 0] > -0.5) & (moved[:, 0] < 79.5)
+    back = second + torch.tensor([float(shift), 0])
+    near = torch.cdist(moved[inside], second[(back[:, 0] > -0.5) & (back[:, 0] < 79.5)]) <= 3
+    most = int((maximum_bipartite_matching(csr_matrix(near.numpy())) >= 0).sum())
+    assert most / 2 <= score.paired <= most
+    assert score.paired <= score.fewer
+
+
+def test_a_cluster_repeats_but_has_one_partner() -> None:
+    cluster = torch.tensor([[40.0, 30], [41, 30], [40, 31], [41, 31]])
+    score = repeatability(row_of_two(0), wall(), cluster, cluster[:1] + 0.4)
+    assert (score.repeated, score.counted) == (5, 5)
+    assert (score.paired, score.fewer) == (1, 1)
+    score = repeatability(row_of_two(0), wall(), cluster, torch.cat([cluster[:1], grid()]))
+    assert score.paired == 1
+
+
+def test_the_nearest_are_paired_first() -> None:
+    # One after the other from the left, all three would be paired.
+    first = torch.tensor([[20.0, 30], [24, 30], [50, 30]])
+    second = torch.tensor([[22.9, 30], [26.9, 30], [50, 30]])
+    assert repeatability(row_of_two(0), wall(), first, second).paired == 2
 
 
 def test_the_share_counts_both_views() -> None:
@@ -138,13 +175,20 @@ def test_points_behind_the_other_camera_do_not_count() -> None:
 def test_no_points_are_no_error() -> None:
     score = repeatability(row_of_two(0), wall(), grid(), torch.zeros(0, 2))
     assert (score.repeated, score.counted) == (0, len(grid()))
+    assert (score.paired, score.fewer) == (0, 0)
+    assert math.isnan(score.one_to_one)
 
 
 def test_pairs_are_pooled_by_their_points() -> None:
     total = pooled(
-        [Repeatability(1, 2, 2.0), Repeatability(9, 10, 1.0), Repeatability(0, 8, math.nan)]
+        [
+            Repeatability(1, 2, 2.0, 1, 1),
+            Repeatability(9, 10, 1.0, 3, 5),
+            Repeatability(0, 8, math.nan, 0, 4),
+        ]
     )
     assert total.share == 0.5
+    assert total.one_to_one == 0.4
     assert_close(total.error, 1.1)
 
 
