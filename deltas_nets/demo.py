@@ -37,6 +37,7 @@ def run_demo(
             "predict": to_dict(config),
             "network": to_dict(model.config),
             "weights": weights,
+            "precision": str(model.dtype).removeprefix("torch."),
         },
         overwrite=overwrite,
         head={"versions": {"deltas-depth": __version__, "torch": torch.__version__}},

@@ -17,7 +17,9 @@ WIDTH = 64
 """Channels of a point's embedding."""
 # A neighbour's posterior never rules out a depth altogether.
 _FLOOR = 3e-3
-_FAINT = 1e-30
+# As good as never: softmax makes a normal number of it, and processors take many times as long
+# for products of numbers that are smaller.
+_UNHEARD = -60.0
 
 
 class Exchanged(NamedTuple):
@@ -58,9 +60,11 @@ class Context(nn.Module):
         peak = probability.amax(dim=-1)
         state = torch.stack([entropy, peak], dim=-1)
         points = self.embed(torch.cat([features, state, positions], dim=-1))
+        # A point must not confirm itself.
+        itself = -1e4 * torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
         stages = [logits]
         for exchange in self.rounds:
-            stages.append(exchange(stages[-1], points, positions))
+            stages.append(exchange(stages[-1], points, positions, itself))
         return Exchanged(stages, points)
 
 
@@ -76,34 +80,38 @@ class _Round(nn.Module):
         self.gain = nn.Parameter(torch.full((heads,), gain))
         self.mix = smooth_scores(1 + heads)
 
-    def forward(self, logits: Tensor, points: Tensor, positions: Tensor) -> Tensor:
-        attention = self._attention(points, positions)
-        # Processors take many times as long for products of numbers below the least normal one.
-        told = (attention.flatten(1, 2) + _FAINT) @ logits.softmax(dim=-1)
+    def forward(self, logits: Tensor, points: Tensor, positions: Tensor, itself: Tensor) -> Tensor:
+        attention = self.attention(points, positions, itself)
+        told = attention.flatten(1, 2) @ logits.softmax(dim=-1)
         evidence = (told.view(*attention.shape[:-1], -1) + _FLOOR).log() - math.log(_FLOOR)
         correction = self.mix(torch.cat([logits[:, None] / 10, evidence], dim=1)).squeeze(1)
         told_in_all = (self.gain[:, None, None] * evidence).sum(dim=1)
         updated: Tensor = logits + told_in_all + 4 * correction
         return updated
 
-    def _attention(self, points: Tensor, positions: Tensor) -> Tensor:
+    def attention(self, points: Tensor, positions: Tensor, itself: Tensor) -> Tensor:
         """How much each point listens to each other, ``(B, heads, N, N)``; the rows' sums are 1.
 
-        The softmax of q k / 4 - |x - y|^2 / reach^2 + trust. All of it is one product: the square
-        is written out, and what a row has in common is left out, for a softmax does not see it.
+        The softmax of q k / 4 - |x - y|^2 / reach^2 + trust + itself, all of it one product in
+        which the square is written out.
+
+        Args:
+            points: ``(B, N, 64)``.
+            positions: ``(B, N, 2)`` in image widths.
+            itself: ``(N, N)`` very negative on the diagonal, 0 elsewhere.
         """
         query = self.query(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
         key = self.key(points).unflatten(-1, (self.heads, 16)).transpose(1, 2)
         trust = self.trust(points).mT.unsqueeze(-1)
         places = (positions - 0.5)[:, None].expand(*query.shape[:-1], 2)
         fall = torch.exp(-2 * self.log_reach)[:, None, None].expand_as(trust)
-        query = torch.cat([query / 4, 2 * fall * places, -fall, torch.ones_like(trust)], dim=-1)
         squares = places.square().sum(dim=-1, keepdim=True)
-        key = torch.cat([key, places, squares, trust], dim=-1)
-        # A point must not confirm itself.
-        itself = torch.eye(query.shape[-2], dtype=query.dtype, device=query.device)
-        product = torch.baddbmm(-1e4 * itself, query.flatten(0, 1), key.flatten(0, 1).mT)
-        return product.view(*query.shape[:-1], -1).softmax(dim=-1)
+        one = torch.ones_like(trust)
+        query = torch.cat([query / 4, 2 * fall * places, -fall, -fall * squares, one], dim=-1)
+        key = torch.cat([key, places, squares, one, trust], dim=-1)
+        product = torch.baddbmm(itself, query.flatten(0, 1), key.flatten(0, 1).mT)
+        heard = torch.maximum(product, itself + _UNHEARD)
+        return heard.view(*query.shape[:-1], -1).softmax(dim=-1)
 
 
 def smooth_scores(inputs: int) -> nn.Sequential:
