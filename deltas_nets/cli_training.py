@@ -43,8 +43,8 @@ class Train:
     resume: Flag = False
     """Go on from the checkpoint in --out, with the config recorded there. Only what changes no
     result may be given anew: --devices, --num-nodes, --data.cache, --data.workers, --root."""
-    init: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Start from these weights."""
+    init: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Start from these weights: a shipped network's, or a file's."""
     start_step: int = 0
     """Go on in the schedule at this step (with --init)."""
     checkpoint_every: int = 200
@@ -62,6 +62,7 @@ class Train:
         """Do it."""
         from deltas_nets.checked_inputs import encoder_file
         from deltas_nets.outputs import check_writable
+        from deltas_nets.pretrained import weights_file
         from deltas_nets.train.fit import fit
         from deltas_nets.train.resume import resumed_config
         from deltas_nets.train.start import Start
@@ -87,7 +88,8 @@ class Train:
         fresh = not self.resume and self.init is None
         wanted = fresh and (config.network.backbone == "lite" or self.encoder != "pretrained")
         encoder = encoder_file(self.encoder) if wanted else None
-        start = Start(encoder, self.init, self.start_step, self.resume, self.teacher_weights)
+        init = None if self.init is None else weights_file(self.init)
+        start = Start(encoder, init, self.start_step, self.resume, self.teacher_weights)
         weights = fit(
             config,
             self.out,

@@ -208,20 +208,26 @@ def record_of(config: DistillConfig, before: dict[str, str], loss: Tensor) -> di
         loss: ``()`` of the last steps.
     """
     kept = {k: v for k, v in before.items() if k not in _OF_OTHER_WEIGHTS}
-    taught = f"detector distilled from {config.teacher}"
-    # A teacher is named once, however often it taught, and the last one last.
-    parts = before.get("origin", "unknown weights").split("; ")
+    origin = before.get("origin", "unknown weights")
+    # Of a teacher that taught before, something is left.
+    licences, licence = before.get("detector_teacher_licence", ""), LICENCES[config.teacher]
     return kept | {
-        "origin": "; ".join([*(part for part in parts if part != taught), taught]),
+        "origin": _with_last(origin, f"detector distilled from {config.teacher}"),
         "detector_teacher": config.teacher,
         "detector_teacher_file": config.teacher_weights.name,
-        "detector_teacher_licence": LICENCES[config.teacher],
+        "detector_teacher_licence": _with_last(licences, licence),
         "detector_data": f"{config.num_images} pictures: {_pictures(config)}",
         "detector_config": json.dumps(_public(config)),
         "detector_steps": str(config.steps),
         "detector_seed": str(config.seed),
         "detector_loss": f"{float(loss):.4f}",
     }
+
+
+def _with_last(listed: str, new: str) -> str:
+    """A list with one more at its end, and that only there."""
+    kept = [part for part in listed.split("; ") if part and part != new]
+    return "; ".join([*kept, new])
 
 
 def _pictures(config: DistillConfig) -> str:

@@ -353,6 +353,11 @@ def test_train_resume_and_refusal(run: Run, tmp_path: Path) -> None:
     assert run("train", "--out", out, "--steps", 2, *tiny).code == 0
     assert (out / "weights.safetensors").exists()
     assert_one_line(run("train", "--out", out, *tiny), "another run", "--resume")
+    shipped = run("train", "--out", tmp_path / "on", "--steps", 1, *tiny, "--init", "deltas-small")
+    assert shipped.code == 0, shipped.err
+    missing = ["--out", tmp_path / "no", "--init", "deltas-large"]
+    assert_one_line(run("train", *missing), "no such weights, deltas-large", "deltas-small")
+    assert not (tmp_path / "no").exists()
     assert run("train", "--out", out, "--resume").code == 0
     assert_one_line(run("train", "--out", tmp_path / "x", "--resume"), "nothing to resume")
     fresh = ["train", "--out", tmp_path / "x"]

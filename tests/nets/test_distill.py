@@ -21,7 +21,7 @@ from deltas_nets.config import CONFIGS
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.pretrained import load_model, read_metadata, save_weights, weights_file
-from deltas_nets.teachers import TEACHERS
+from deltas_nets.teachers import LICENCES, TEACHERS
 from deltas_nets.teachers.superpoint import SuperPoint
 from deltas_nets.train import distill as distill_module
 from deltas_nets.train import distill_pictures
@@ -105,6 +105,8 @@ def test_a_teacher_is_named_once_and_the_last_one_last(taught: list[Any]) -> Non
     assert sorted(named) == sorted(f"detector distilled from {teacher}" for teacher in set(taught))
     assert named[-1] == f"detector distilled from {taught[-1]}"
     assert record["detector_teacher"] == taught[-1] and record["detector_loss"] == "0.5000"
+    licences = record["detector_teacher_licence"].split("; ")
+    assert sorted(licences) == sorted({LICENCES[teacher] for teacher in taught})
 
 
 def test_what_was_repeated_before_is_said_once() -> None:

@@ -128,7 +128,7 @@ def test_files_that_cannot_be_read_are_errors_of_the_user(name: str, tmp_path: P
             load_teacher(name, file)
     code = tmp_path / "code.pth"
     torch.save({"weight": Path}, code)  # a class: loading it could run code
-    with pytest.raises(UserError, match="not a file of weights alone"):
+    with pytest.raises(UserError, match=r"not a file of weights alone|not a safetensors file"):
         load_teacher(name, code)
 
 
@@ -215,6 +215,7 @@ def untrained(name: str) -> torch.nn.Module:
         "aliked": lambda: AlikedScores(ALIKED(model_name="aliked-t16")),
         "disk": lambda: DiskScores(DISK()),
         "xfeat": lambda: XfeatScores(XFeatModel()),
+        "deltas": lambda: load_teacher("deltas", "deltas-small"),
     }
     network: torch.nn.Module = made[name]().eval()
     return network
@@ -269,6 +270,17 @@ class FakeXfeat(torch.nn.Module):
 
     def forward(self, images: Tensor) -> tuple[None, Tensor, Tensor]:
         return None, *self.answer
+
+
+@pytest.mark.parametrize("size", [(64, 96), (51, 70)])
+def test_a_network_of_ours_teaches_what_it_finds_itself(size: tuple[int, int]) -> None:
+    images = torch.rand(2, 3, *size)
+    model = load_model()
+    with torch.no_grad():
+        scores = load_teacher("deltas", "deltas-small")(images)
+        features = model.encoder(images[:, None])
+        logits = model.detector(features, image_size=size).logits
+    assert_close(scores, detector_heatmap(logits, image_size=size))
 
 
 def test_channels_of_xfeat_are_pixels_as_kornia_has_them() -> None:
