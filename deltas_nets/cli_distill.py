@@ -1,4 +1,4 @@
-"""The command `deltas distill`: interest points that a published detector finds."""
+"""The command `deltas distill`: interest points that another detector finds, or finds again."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from deltas_nets.config.distill import DistillConfig
 
 @dataclass(frozen=True)
 class Distill(DistillConfig):
-    """Teach the detector of weights to find a published detector's points.
+    """Teach the detector of weights to find another detector's points, or its own more steadily.
 
     Nothing else of the network changes. The teacher looks at every picture of a pool from several
     sides and keeps what it finds from most; the student learns to find that in other light. The

@@ -39,7 +39,7 @@ class Train:
     deltas-vgg9 are the paper's, with its losses and schedule."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     teacher_weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Published weights of --teacher; a resumed run wants them again."""
+    """Published weights of --teacher, or a network of ours; a resumed run wants them again."""
     resume: Flag = False
     """Go on from the checkpoint in --out, with the config recorded there. Only what changes no
     result may be given anew: --devices, --num-nodes, --data.cache, --data.workers, --root."""

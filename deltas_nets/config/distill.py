@@ -14,9 +14,10 @@ class DistillConfig:
     """Train the detector head of a network to find a teacher's points."""
 
     teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"]
-    """Whose points are wanted."""
+    """Whose points are wanted; deltas is a network of ours, perhaps the one that learns: what it
+    finds from many sides is steadier than what it finds from one."""
     teacher_weights: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """The teacher's published weights."""
+    """The teacher's published weights; of deltas also a shipped network's name."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Weights file to write, .safetensors: the network with its new detector."""
     init: str = "deltas-small"
