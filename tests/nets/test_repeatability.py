@@ -114,6 +114,20 @@ def test_pairs_are_fewer_than_the_most_that_can_be_made_and_at_least_half(
     assert score.paired <= score.fewer
 
 
+def test_a_pair_is_near_in_both_views() -> None:
+    # The second view sees everything twice as large: 2 px of the first are 4 px there.
+    views = row_of_two(0)
+    larger = views.K.clone()
+    larger[1, 0, 0] = larger[1, 1, 1] = 2 * FOCAL
+    views = views._replace(K=larger)
+    first, off = torch.tensor([[35.0, 27]]), torch.tensor([[30.5 - 4, 24.5]])
+    for pair in (
+        repeatability(views, wall(), first, off),
+        repeatability(views.select([1, 0]), wall(), off, first),
+    ):
+        assert (pair.repeated, pair.counted, pair.paired, pair.fewer) == (1, 2, 0, 1)
+
+
 def test_a_cluster_repeats_but_has_one_partner() -> None:
     cluster = torch.tensor([[40.0, 30], [41, 30], [40, 31], [41, 31]])
     score = repeatability(row_of_two(0), wall(), cluster, cluster[:1] + 0.4)
