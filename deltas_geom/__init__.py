@@ -31,12 +31,12 @@ from deltas_geom.projection import Projection, pixel_rays, project, unproject
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
 from deltas_geom.rays import triangulate_rays
 from deltas_geom.refine import Refined, refine_points
-from deltas_geom.robust import RobustTriangulation, triangulate_robust
+from deltas_geom.robust import triangulate_robust
 from deltas_geom.sampling import Samples, sample_inv_depths, sample_map, sample_segments
 from deltas_geom.segments import Segments, epipolar_segments
 from deltas_geom.status import Status
 from deltas_geom.tracks import TriangulatedTracks, triangulate_tracks
-from deltas_geom.triangulated import Triangulation
+from deltas_geom.triangulated import RobustTriangulation, Triangulation
 from deltas_geom.triangulation import triangulate, triangulate_points
 from deltas_geom.two_view import TwoViewTriangulation, triangulate_two_view
 from deltas_geom.uncertainty import (

@@ -61,6 +61,13 @@ def check_bool(**named: Tensor | None) -> None:
             raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}")
 
 
+def check_floating(**named: Tensor) -> None:
+    """Raise ``TypeError`` unless every tensor is of real floating point numbers."""
+    for name, tensor in named.items():
+        if not tensor.is_floating_point():
+            raise TypeError(f"{name} must be floating point, got {tensor.dtype}: use .float()")
+
+
 def check_index(**named: Tensor) -> None:
     """Raise ``TypeError`` unless every tensor holds integers."""
     for name, index in named.items():

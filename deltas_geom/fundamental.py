@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
 from deltas_geom.precision import promoted, without_autocast
@@ -44,8 +44,13 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
         ``(*B, 3, 3)``, F = K_s^-T [t]x R K_a^-1, not normalised: its scale follows the
         baseline, and at zero baseline it is zero.
 
+    Raises:
+        ShapeError: shapes of the cameras do not go together.
+        IndexError: there is no such view.
+
     Source: Hartley and Zisserman, 2nd ed., equation 9.2; the paper, section 3.2.
     """
+    views.check_shapes()
     K, cam_from_world = promoted(*views)
     source_from_anchor = relative_pose(
         cam_from_world[..., source, :, :], cam_from_world[..., anchor, :, :]
@@ -72,11 +77,12 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
         zero and passes no gradient.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or batch dims do not broadcast.
 
     Source: Hartley and Zisserman, 2nd ed., section 9.2.
     """
     check_shapes(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
+    batch_shape(fundamental.shape[:-2], pixels.shape[:-2])
     fundamental, pixels = promoted(fundamental, pixels)
     lines = to_homogeneous(pixels) @ fundamental.mT
     size = lines[..., :2].detach().abs().amax(dim=-1, keepdim=True)
@@ -101,6 +107,10 @@ def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Ten
 
     Returns:
         ``(*B, N)`` pixels; 0 where there is no line.
+
+    Raises:
+        ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
-    check_shapes(first=(first, "N 2"), second=(second, "N 2"))
+    check_shapes(fundamental=(fundamental, "3 3"), first=(first, "N 2"), second=(second, "N 2"))
+    batch_shape(fundamental.shape[:-2], first.shape[:-2], second.shape[:-2])
     return (epipolar_lines(fundamental, first) * to_homogeneous(second)).sum(dim=-1)

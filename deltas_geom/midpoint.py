@@ -10,15 +10,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import batch_shape, check_floating, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
 from deltas_geom.poses import camera_centers
 from deltas_geom.precision import without_autocast
+from deltas_geom.reprojection import parallax_of
 from deltas_geom.status import Status
 from deltas_geom.triangulated import Triangulation
-from deltas_geom.uncertainty import parallax_of
 
 _Vector = tuple[Tensor, ...]
 """Three components, each of any shape."""
@@ -95,6 +95,7 @@ def _triangulate(
     cameras: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None, *, stepped: bool
 ) -> Triangulation:
     check_shapes(cam_from_world=(cameras, "+V 4 4"), rays=(rays, "V N 3"))
+    check_floating(cam_from_world=cameras, rays=rays)
     check_weights(weights, mask, "rays", rays, "V N 3", cameras.shape[:-3])
     dtype = rays.dtype
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
 from deltas_geom.chunks import values_at_hand
 
 # A view whose weight is below this share of the point's largest counts as no view: its squared
@@ -229,6 +229,15 @@ def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(sound.unsqueeze(-2), xy, xy.new_zeros(())), sound
 
 
+def check_observed(
+    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> torch.Size:
+    """:func:`check_weights` of pixels ``(*B, V, N, 2)`` seen by cameras ``(*B, V, 3, 4)``."""
+    check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"))
+    check_floating(proj=proj)
+    return check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+
+
 def check_weights(
     weights: Tensor | None,
     mask: Tensor | None,
@@ -242,12 +251,12 @@ def check_weights(
     Returns:
         The batch dims to which all broadcast.
     """
-    check_bool(mask=mask)
     shapes = [batch, seen.shape[:-3]]
     for label, tensor in (("weights", weights), ("mask", mask)):
         if tensor is not None:
-            check_shapes(**{label: (tensor, "V N"), name: (seen, dims)})
+            check_shapes(**{name: (seen, dims), label: (tensor, "V N")})
             shapes.append(tensor.shape[:-2])
+    check_bool(mask=mask)
     return batch_shape(*shapes)
 
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.precision import promoted, without_autocast
 
 
@@ -26,6 +26,8 @@ def invert_pose(b_from_a: Tensor) -> Tensor:
 @without_autocast
 def relative_pose(b_from_world: Tensor, a_from_world: Tensor) -> Tensor:
     """``b_from_a`` ``(*B, 4, 4)`` of two cameras posed in one world; ``*B`` broadcasts."""
+    check_shapes(b_from_world=(b_from_world, "4 4"), a_from_world=(a_from_world, "4 4"))
+    batch_shape(b_from_world.shape[:-2], a_from_world.shape[:-2])
     b_from_world, a_from_world = promoted(b_from_world, a_from_world)
     return b_from_world @ invert_pose(a_from_world)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import invert_pose
 from deltas_geom.precision import promoted, without_autocast
@@ -37,7 +37,7 @@ def project(views: PosedViews, points: Tensor) -> Projection:
         points: ``(*B, N, 3)`` in the world, metres. ``*B`` broadcasts with the views'.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or batch dims do not broadcast.
 
     Source: Hartley and Zisserman, 2nd ed., section 6.1.
 
@@ -48,6 +48,7 @@ def project(views: PosedViews, points: Tensor) -> Projection:
         tensor([[[50., 45.]]])
     """
     check_shapes(points=(points, "N 3"))
+    batch_shape(views.check_shapes(), points.shape[:-2])
     finite = points.isfinite().all(dim=-1)
     # A NaN would reach the gradient of every camera through the product below.
     known = torch.where(finite[..., None], points, 0.0)
@@ -76,9 +77,11 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
         ``(*B, V, N, 3)`` world points, metres.
 
     Raises:
-        ShapeError: a trailing shape differs.
+        ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
+    batch = views.check_shapes()
     check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"), depth=(depth, "V N"))
+    batch_shape(batch, pixels.shape[:-3], depth.shape[:-2])
     K, cam_from_world, pixels, depth = promoted(*views, pixels, depth)
     rays = pixel_rays(K, pixels)
     world_from_cam = invert_pose(cam_from_world)
@@ -95,8 +98,12 @@ def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
 
     Returns:
         ``(*B, N, 3)``; the last coordinate is 1.
+
+    Raises:
+        ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
     check_shapes(K=(K, "3 3"), pixels=(pixels, "N 2"))
+    batch_shape(K.shape[:-2], pixels.shape[:-2])
     # Back substitution: exact for a camera and cheaper than a general inverse.
     y = (pixels[..., 1] - K[..., 1, 2, None]) / K[..., 1, 1, None]
     x = (pixels[..., 0] - K[..., 0, 2, None] - K[..., 0, 1, None] * y) / K[..., 0, 0, None]

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_bool, check_image_size, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_image_size, check_shapes
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.precision import promoted, without_autocast
 
@@ -51,8 +51,9 @@ def rasterize_depth(
         of bilinear splats), and weight.
 
     Raises:
-        ShapeError: a trailing shape differs.
-        TypeError: the mask is not bool.
+        ShapeError: a trailing shape differs, or batch dims do not broadcast.
+        TypeError: the mask is not bool, or the weights are no tensor.
+        ValueError: unknown reduce or splat, or an image without pixels.
 
     Source: the paper, section 3.3.
 
@@ -64,6 +65,12 @@ def rasterize_depth(
     """
     check_image_size(image_size)
     check_shapes(pixels=(pixels, "N 2"), depth=(depth, "N"))
+    shapes = [pixels.shape[:-2], depth.shape[:-1]]
+    for name, tensor in (("mask", mask), ("weights", weights)):
+        if tensor is not None:
+            check_shapes(pixels=(pixels, "N 2"), **{name: (tensor, "N")})
+            shapes.append(tensor.shape[:-1])
+    batch = batch_shape(*shapes)
     check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
     pixels, depth, given = promoted(pixels, depth, given)
@@ -71,7 +78,6 @@ def rasterize_depth(
     used = used & pixels.isfinite().all(dim=-1)
     if mask is not None:
         used = used & mask
-    batch = used.shape[:-1]
     # Double where: what is not used must pass no gradient and no NaN.
     pixels = torch.where(used[..., None], pixels.expand(*used.shape, 2), 0.0)
     depth = torch.where(used, depth, 0.0)

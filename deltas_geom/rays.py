@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import check_floating, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.ldl import Symmetric4, Vector4
@@ -24,6 +24,7 @@ from deltas_geom.observations import (
 )
 from deltas_geom.poses import camera_centers
 from deltas_geom.precision import without_autocast
+from deltas_geom.reprojection import parallax_of
 from deltas_geom.rig_frame import (
     FoundPoints,
     RigFrame,
@@ -36,7 +37,6 @@ from deltas_geom.rig_frame import (
 )
 from deltas_geom.status import Status
 from deltas_geom.triangulated import Triangulation
-from deltas_geom.uncertainty import parallax_of
 
 
 @without_autocast
@@ -77,6 +77,7 @@ def triangulate_rays(
         tensor([[0.2000, 0.1000, 2.0000]])
     """
     check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), rays=(rays, "V N 3"))
+    check_floating(cam_from_world=cam_from_world, rays=rays)
     check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
 
     def known(seen: _Seen, points: Vector3, status: Tensor) -> tuple[Tensor, ...]:

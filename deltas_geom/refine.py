@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import batch_shape, check_floating, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.homogeneous import safe_sqrt
 from deltas_geom.normal_matrix import Symmetric3, normal_matrix, second_derivative, solve3_scaled
@@ -103,6 +103,7 @@ def refine_points(
         tensor([[0.2000, 0.1000, 2.0000]])
     """
     check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"), points=(points, "N 3"))
+    check_floating(proj=proj, points=points)
     batch = batch_shape(proj.shape[:-3], points.shape[:-2])
     check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
     if loss not in ("squared", "huber", "cauchy"):

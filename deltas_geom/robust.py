@@ -8,38 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
 from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
+from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_observed, solver_dtype
 from deltas_geom.precision import without_autocast
 from deltas_geom.status import Status
+from deltas_geom.triangulated import RobustTriangulation
 from deltas_geom.triangulation import triangulate, triangulate_points
 
 _BUDGET = 2**17  # distances at a time: what lies between stays in the cache
-
-
-class RobustTriangulation(NamedTuple):
-    """The fields of :class:`Triangulation`, of the inliers, and which views those are.
-
-    Attributes:
-        points: ``(*B, N, 3)`` in the world, metres; (0, 0, 0) with zero gradient if not valid.
-        depth: ``(*B, V, N)`` metres, also in views that are outliers; 0 if not valid.
-        status: ``(*B, N)`` int8 of :class:`Status`.
-        valid: ``(*B, N)`` bool, status is OK.
-        residual: ``(*B, N)`` weighted RMS distance, px.
-        parallax: ``(*B, N)`` largest angle, rad.
-        covariance: ``(*B, N, 3, 3)`` m^2; None unless asked for.
-        inliers: ``(*B, V, N)`` bool, the views used; none if not valid.
-    """
-
-    points: Tensor
-    depth: Tensor
-    status: Tensor
-    valid: Tensor
-    residual: Tensor
-    parallax: Tensor
-    covariance: Tensor | None
-    inliers: Tensor
 
 
 @without_autocast
@@ -81,8 +57,9 @@ def triangulate_robust(
 
     Returns:
         What :func:`triangulate` says of the inliers. Where no candidate has ``min_inliers`` the
-        status is that of all views if it is a failure, else TOO_FEW_VIEWS: too few that agree.
-        Views that are not finite are outliers. Gradients are those of ``triangulate`` with the
+        status is that of all finite views if it is a failure, else TOO_FEW_VIEWS: too few that
+        agree. Views that are not finite are outliers; NOT_FINITE_INPUT is the status where without
+        them fewer than two are left. Gradients are those of ``triangulate`` with the
         inliers as its mask: none to outliers. Nothing raises or turns NaN because of values.
 
     Raises:
@@ -100,8 +77,7 @@ def triangulate_robust(
         >>> result.inliers[:, 0].tolist(), result.points.round(decimals=3)
         ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
-    check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"))
-    check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    check_observed(proj, pixels, weights, mask)
     if not threshold > 0:
         raise ValueError(f"threshold must be positive, got {threshold}")
     if min_inliers < 2:
@@ -163,7 +139,7 @@ def _observe(
     weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
     if mask is not None:
         weight = torch.where(mask, weight, 0.0)
-    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    batch = check_observed(proj, pixels, weights, mask)
     weight = weight.to(work).abs().expand(*batch, *weight.shape[-2:])
     pixels = pixels.to(work).expand(*weight.shape, 2)
     proj = proj.to(work).expand(*batch, *proj.shape[-3:])
@@ -216,8 +192,9 @@ def _consensus(
     # Points that failed are 0. One that lies there in truth merely stays as it is.
     there = (again != 0).any(dim=-1).unsqueeze(-2)
     inliers, _ = _better(best, judge(again.mT.unsqueeze(-2), there))
-    disagree = torch.where(plain.valid, int(Status.TOO_FEW_VIEWS), plain.status)
-    return inliers, torch.where(observed.finite, disagree, int(Status.NOT_FINITE_INPUT))
+    reason = torch.where(plain.valid, int(Status.TOO_FEW_VIEWS), plain.status)
+    explained = observed.finite | (observed.usable.sum(dim=-2) >= 2)
+    return inliers, torch.where(explained, reason, int(Status.NOT_FINITE_INPUT))
 
 
 def _better(one: _Best, other: _Best) -> _Best:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_depth_range, check_image_size, check_shapes
+from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
 from deltas_geom.fundamental import inverse_intrinsics
 from deltas_geom.homogeneous import safe_divide, to_homogeneous
 from deltas_geom.poses import relative_pose
@@ -90,8 +90,13 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     Args:
         views: the anchor (view 0) and its V-1 sources.
         pixels: ``(*B, N, 2)`` keypoints of the anchor.
+
+    Raises:
+        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
     """
+    batch = views.check_shapes()
     check_shapes(K=(views.K, "+V 3 3"), pixels=(pixels, "N 2"))
+    batch_shape(batch, pixels.shape[:-2])
     K, cam_from_world, pixels = promoted(*views, pixels)
     source_from_anchor = relative_pose(cam_from_world[..., 1:, :, :], cam_from_world[..., :1, :, :])
     K_source = K[..., 1:, :, :]
@@ -150,7 +155,7 @@ def epipolar_segments(
         float32 that rounding is smaller if the world's origin is near the cameras.
 
     Raises:
-        ShapeError: a trailing shape differs, or there is no view.
+        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
         ValueError: the depth range or the image size makes no sense.
 
     Source: the paper, section 3.2 and figure 3; clipping as in Liang and Barsky (1984).

@@ -6,10 +6,10 @@ from enum import IntEnum
 class Status(IntEnum):
     """Outcome of one point or one segment; stored as int8 tensors.
 
-    OK: valid. TOO_FEW_VIEWS: fewer than two views count. NO_PARALLAX: depth cannot be seen from
-    where the cameras stand. AT_INFINITY: the rays are parallel. BEHIND_CAMERA: they meet behind a
-    used camera. NOT_FINITE_INPUT: something used is NaN or infinite. EMPTY: nothing of the depth
-    range is visible (segments). OUT_OF_RANGE: the depth is not within the range asked for.
+    OK: valid. TOO_FEW_VIEWS: fewer than two views count, or agree. NO_PARALLAX: depth cannot be
+    seen from where the cameras stand. AT_INFINITY: the rays are parallel. BEHIND_CAMERA: they meet
+    behind a used camera. NOT_FINITE_INPUT: something used is NaN or infinite. EMPTY: nothing of the
+    depth range is visible (segments). OUT_OF_RANGE: the depth is not within the range asked for.
 
     Example:
         >>> print(Status.BEHIND_CAMERA.explanation)
@@ -34,11 +34,12 @@ class Status(IntEnum):
 _EXPLANATIONS = {
     Status.OK: "the result is valid",
     Status.TOO_FEW_VIEWS: (
-        "fewer than two views have a true mask and a weight that counts: add matches for this point"
+        "fewer than two views have a true mask and a weight that counts, or agree: add matches for "
+        "this point"
     ),
     Status.NO_PARALLAX: (
         "the used cameras are in line with the point, so depth cannot be seen: add a view from "
-        "elsewhere"
+        "elsewhere; in float32 also if the world's origin is far away: use float64"
     ),
     Status.AT_INFINITY: (
         "the rays are parallel within rounding: treat the point as a direction, or widen the "
@@ -54,6 +55,7 @@ _EXPLANATIONS = {
         "no depth of the range is visible in this source: widen the range or choose another view"
     ),
     Status.OUT_OF_RANGE: (
-        "the rays meet nearer or farther than the depth range: a match is wrong, or widen the range"
+        "the rays meet nearer or farther than the depth range, or behind the view whose range it "
+        "is: a match is wrong, or widen the range"
     ),
 }

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import ShapeError, check_index, check_shapes
+from deltas_geom.checks import ShapeError, check_floating, check_index, check_shapes
 from deltas_geom.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.ldl import Vector4
 from deltas_geom.observations import Vector3
@@ -104,12 +104,20 @@ def triangulate_tracks(
         point_index=(point_index, "T"),
     )
     check_index(camera_index=camera_index, point_index=point_index)
-    if weights is not None:
-        check_shapes(pixels=(pixels, "T 2"), weights=(weights, "T"))
+    check_floating(proj=proj)
+    weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
+    check_shapes(pixels=(pixels, "T 2"), weights=(weight, "T"))
     # A list has no batch: cameras and points of all scenes may share one list instead.
-    for name, tensor, dims in (("proj", proj, "C, 3, 4"), ("pixels", pixels, "T, 2")):
-        if tensor.dim() != dims.count(",") + 1:
-            raise ShapeError(f"{name} must have shape ({dims}), got {tuple(tensor.shape)}")
+    for name, tensor, dims in (
+        ("proj", proj, ("C", "3", "4")),
+        ("pixels", pixels, ("T", "2")),
+        ("camera_index", camera_index, ("T",)),
+        ("point_index", point_index, ("T",)),
+        ("weights", weight, ("T",)),
+    ):
+        if tensor.dim() != len(dims):
+            wanted = f"({', '.join(dims)})"
+            raise ShapeError(f"{name} must have shape {wanted}, got {tuple(tensor.shape)}")
     if num_points < 0:
         raise ValueError(f"num_points must not be negative, got {num_points}")
 
@@ -145,7 +153,6 @@ def triangulate_tracks(
         near = derivable_points(posed.normal, posed.frame, found.vector, valid)
         return known(posed, kept(near, posed.around, valid), status)
 
-    weight = torch.ones_like(pixels[:, 0]) if weights is None else weights
     inputs = (proj, pixels, camera_index.long(), point_index.long(), weight)
     points, depth, residual, status = recomputed(derivable, *inputs, values=values)
     return TriangulatedTracks(points, depth, status, status == Status.OK.value, residual)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_depth_range
+from deltas_geom.checks import check_bool, check_depth_range, check_shapes
 from deltas_geom.status import Status
 
 
@@ -20,8 +20,9 @@ class Triangulation(NamedTuple):
         residual: ``(*B, N)`` weighted RMS distance of the projections from the pixels, px.
         parallax: ``(*B, N)`` largest angle between rays of used views, rad.
         covariance: ``(*B, N, 3, 3)`` for pixel noise of standard deviation 1 / weight px, m^2;
-            None unless asked for. It is that of the least reprojection error, which one step of
-            :func:`deltas_geom.refine_points` reaches; linear solutions scatter a little more.
+            None unless asked for; 0 if not valid, which does not mean exact. It is that of the
+            least reprojection error, which one step of :func:`deltas_geom.refine_points` reaches;
+            linear solutions scatter a little more.
     """
 
     points: Tensor
@@ -32,7 +33,9 @@ class Triangulation(NamedTuple):
     parallax: Tensor
     covariance: Tensor | None
 
-    def within_depth(self, depth_range: tuple[float, float], *, view: int = 0) -> "Triangulation":
+    def within_depth(
+        self, depth_range: tuple[float, float], *, view: int = 0, used: Tensor | None = None
+    ) -> "Triangulation":
         """The same without the points that a view has nearer or farther than a range.
 
         A slightly wrong match of nearly parallel rays is a point kilometres away, and valid. Where
@@ -41,11 +44,16 @@ class Triangulation(NamedTuple):
 
         Args:
             depth_range: (near, far) metres, both included; far may be infinite.
-            view: whose depth counts, whether or not it saw the point.
+            view: whose depth counts, whether or not it saw the point: what is behind it, or all
+                if the camera is not finite, is out of range. Right for the anchor of a network.
+            used: ``(*B, V, N)`` bool, the mask that the points were triangulated with: instead of
+                ``view``, every view that saw a point must have it in the range. Right for cameras
+                all around.
 
         Raises:
             ValueError: the range makes no sense.
             IndexError: there is no such view.
+            ShapeError, TypeError: ``used`` has another shape, or is not bool.
 
         Example:
             >>> from deltas_geom import PosedViews, triangulate
@@ -56,21 +64,69 @@ class Triangulation(NamedTuple):
             >>> near_and_far.within_depth((0.5, 100.0)).depth[0]
             tensor([2., 0.])
         """
-        check_depth_range(depth_range)
-        near, far = depth_range
-        depth = self.depth[..., view, :]
-        outside = self.valid & ((depth < near) | (depth > far))
-        covariance = self.covariance
-        return Triangulation(
-            points=torch.where(outside[..., None], 0.0, self.points),
-            depth=torch.where(outside[..., None, :], 0.0, self.depth),
-            status=torch.where(outside, Status.OUT_OF_RANGE.value, self.status),
-            valid=self.valid & ~outside,
-            residual=torch.where(outside, 0.0, self.residual),
-            parallax=torch.where(outside, 0.0, self.parallax),
-            covariance=(
-                None
-                if covariance is None
-                else torch.where(outside[..., None, None], 0.0, covariance)
-            ),
+        if used is None:
+            outside = _beyond(self.depth[..., view, :], depth_range)
+        else:
+            check_shapes(depth=(self.depth, "V N"), used=(used, "V N"))
+            check_bool(used=used)
+            outside = (_beyond(self.depth, depth_range) & used).any(dim=-2)
+        return _without(self, outside)
+
+
+class RobustTriangulation(NamedTuple):
+    """The fields of :class:`Triangulation`, of the inliers, and which views those are.
+
+    Attributes:
+        points: ``(*B, N, 3)`` in the world, metres; (0, 0, 0) with zero gradient if not valid.
+        depth: ``(*B, V, N)`` metres, also in views that are outliers; 0 if not valid.
+        status: ``(*B, N)`` int8 of :class:`Status`.
+        valid: ``(*B, N)`` bool, status is OK.
+        residual: ``(*B, N)`` weighted RMS distance, px.
+        parallax: ``(*B, N)`` largest angle, rad.
+        covariance: ``(*B, N, 3, 3)`` m^2; None unless asked for.
+        inliers: ``(*B, V, N)`` bool, the views used; none if not valid.
+    """
+
+    points: Tensor
+    depth: Tensor
+    status: Tensor
+    valid: Tensor
+    residual: Tensor
+    parallax: Tensor
+    covariance: Tensor | None
+    inliers: Tensor
+
+    def within_depth(self, depth_range: tuple[float, float]) -> "RobustTriangulation":
+        """As :meth:`Triangulation.within_depth`, the range being that of every inlier."""
+        found = Triangulation(
+            self.points,
+            self.depth,
+            self.status,
+            self.valid,
+            self.residual,
+            self.parallax,
+            self.covariance,
         )
+        kept = found.within_depth(depth_range, used=self.inliers)
+        return RobustTriangulation(*kept, self.inliers & kept.valid.unsqueeze(-2))
+
+
+def _beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
+    check_depth_range(depth_range)
+    near, far = depth_range
+    return (depth < near) | (depth > far)
+
+
+def _without(found: Triangulation, outside: Tensor) -> Triangulation:
+    """The same, with those of ``(*B, N)`` that were valid OUT_OF_RANGE."""
+    outside = found.valid & outside
+    cov = found.covariance
+    return Triangulation(
+        points=torch.where(outside[..., None], 0.0, found.points),
+        depth=torch.where(outside[..., None, :], 0.0, found.depth),
+        status=torch.where(outside, Status.OUT_OF_RANGE.value, found.status),
+        valid=found.valid & ~outside,
+        residual=torch.where(outside, 0.0, found.residual),
+        parallax=torch.where(outside, 0.0, found.parallax),
+        covariance=None if cov is None else torch.where(outside[..., None, None], 0.0, cov),
+    )

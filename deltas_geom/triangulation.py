@@ -21,9 +21,10 @@ from deltas_geom.equations import (
     product_of,
 )
 from deltas_geom.ldl import Vector4
-from deltas_geom.observations import Cameras, Observations, Vector3
+from deltas_geom.observations import Cameras, Observations, Vector3, check_observed
 from deltas_geom.precision import without_autocast
 from deltas_geom.recompute import WithLagrangian
+from deltas_geom.reprojection import in_views, parallax_of, reproject, residual_of
 from deltas_geom.rig_frame import (
     FoundPoints,
     derivable_points,
@@ -35,14 +36,7 @@ from deltas_geom.rig_frame import (
 )
 from deltas_geom.status import Status
 from deltas_geom.triangulated import Triangulation
-from deltas_geom.uncertainty import (
-    covariance_of,
-    in_views,
-    parallax_of,
-    reproject,
-    residual_of,
-    unpacked3,
-)
+from deltas_geom.uncertainty import covariance_of, representable, unpacked3
 
 
 @without_autocast
@@ -59,6 +53,7 @@ def triangulate_points(
     (0, 0, 0) stands for no answer, and may be one.
     """
     _check_frame(frame)
+    check_observed(proj, pixels, weights, mask)
 
     def prepare(proj: Tensor) -> Cameras | Alike:
         return prepared(proj, weights, mask, kind=frame)
@@ -119,7 +114,7 @@ def triangulate(
 
     Raises:
         ShapeError: a trailing shape differs, or there is no view.
-        TypeError: the mask is not bool.
+        TypeError: ``proj`` is not floating point, or the mask not bool.
 
     Source: Hartley and Zisserman, 2nd ed., section 12.2; weights as in the paper, section
     3.2, after Iskakov et al. (2019).
@@ -133,8 +128,8 @@ def triangulate(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.0000, 2.0000]])
     """
-
     _check_frame(frame)
+    check_observed(proj, pixels, weights, mask)
 
     def described(solved: _Solved) -> tuple[Tensor, ...]:
         observed, valid = solved.observed, solved.status == Status.OK.value
@@ -147,12 +142,12 @@ def triangulate(
             residual_of(seen, observed.xy, observed.weights.squared),
             parallax_of(solved.centers, solved.points, used.to(seen.x.dtype)),
         )
+        outward = tuple(tensor.to(proj.dtype).clamp(-limit, limit) for tensor in found)
         if covariance:
             noise = unpacked3(covariance_of(observed.proj, seen, observed.weights.squared))
             unit = observed.weights.largest.squeeze(-2)[..., None, None]
             # Divided twice: the square of a small weight may be 0.
-            found = (*found, noise / unit / unit)
-        outward = (tensor.to(proj.dtype).clamp(-limit, limit) for tensor in found)
+            outward = (*outward, representable(noise / unit / unit, proj.dtype))
         return (*outward, solved.status)
 
     def prepare(proj: Tensor) -> Cameras | Alike:

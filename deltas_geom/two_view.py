@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_bool, check_shapes
+from deltas_geom.checks import check_bool, check_floating, check_shapes
 from deltas_geom.chunks import in_chunks
 from deltas_geom.fundamental import cross_matrix
 from deltas_geom.homogeneous import safe_divide, safe_sqrt
@@ -74,8 +74,9 @@ def triangulate_two_view(
         (tensor([[0.2000, 0.0000, 2.0000]]), tensor([2.]))
     """
     check_shapes(proj=(proj, "2 3 4"), pixels=(pixels, "2 N 2"))
+    check_floating(proj=proj)
     if mask is not None:
-        check_shapes(mask=(mask, "2 N"), pixels=(pixels, "2 N 2"))
+        check_shapes(pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
         check_bool(mask=mask)
     dtype = torch.promote_types(proj.dtype, pixels.dtype)
 

@@ -1,27 +1,43 @@
 """What is known about given points: residual, parallax, covariance."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_bool, check_shapes
-from deltas_geom.homogeneous import safe_divide, safe_sqrt
+from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
 from deltas_geom.normal_matrix import Symmetric3, inverse3, normal_matrix
-from deltas_geom.observations import Vector3, projection_centers, solver_dtype
-from deltas_geom.precision import promoted, without_autocast
+from deltas_geom.observations import (
+    Cameras,
+    Vector3,
+    cameras_of,
+    check_weights,
+    clean_pixels,
+    solver_dtype,
+    weigh,
+)
+from deltas_geom.precision import without_autocast
+from deltas_geom.reprojection import Reprojection, parallax_of, reproject, residual_of
 
 
 @without_autocast
-def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
+def reprojection_residual(
+    proj: Tensor, points: Tensor, pixels: Tensor, weights: Tensor, *, mask: Tensor | None = None
+) -> Tensor:
     """Weighted RMS distance of projections from pixels, ``(*B, N)`` px.
 
     Args:
         proj: ``(*B, V, 3, 4)``.
         points: ``(*B, N, 3)``.
-        pixels: ``(*B, V, N, 2)``, finite.
+        pixels: ``(*B, V, N, 2)``; those of unused views may hold anything.
         weights: ``(*B, V, N)``; views of weight 0, and those behind which a point lies, do not
-            count. 0 where no view counts.
+            count.
+        mask: ``(*B, V, N)`` bool, True = used.
+
+    Returns:
+        0 where no view counts, or something used is not finite.
+
+    Raises:
+        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
+        TypeError: ``proj`` is not floating point, or the mask not bool.
     """
     check_shapes(
         proj=(proj, "+V 3 4"),
@@ -29,12 +45,16 @@ def reprojection_residual(proj: Tensor, points: Tensor, pixels: Tensor, weights:
         pixels=(pixels, "V N 2"),
         weights=(weights, "V N"),
     )
-    work = solver_dtype(proj)
-    size = weights.detach().abs().amax(dim=-2, keepdim=True)
-    share = weights.to(work) / torch.where(size > 0, size, 1.0)
-    x, y, z = points.to(work).unbind(dim=-1)
-    seen = reproject(proj.to(work), (x, y, z), weights != 0)
-    return residual_of(seen, pixels.to(work).mT, share * share).to(proj.dtype)
+    check_floating(proj=proj)
+    batch = batch_shape(proj.shape[:-3], points.shape[:-2])
+    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
+    cameras, (places, known) = cameras_of(proj), _clean_points(points)
+    xy, sound = clean_pixels(pixels)
+    sound = sound & (cameras.sick == 0).unsqueeze(-1)
+    weighed = weigh(weights, mask, batch=batch, like=weights.unsqueeze(-1), sound=sound)
+    used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
+    residual = residual_of(reproject(cameras.proj, places, used), xy, weighed.squared)
+    return residual.clamp(max=torch.finfo(proj.dtype).max).to(proj.dtype)
 
 
 @without_autocast
@@ -42,21 +62,36 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     """Largest angle between the rays of used views at a point, ``(*B, N)`` rad.
 
     Args:
-        proj: ``(*B, V, 3, 4)``.
+        proj: ``(*B, V, 3, 4)``; cameras of unused views may hold anything.
         points: ``(*B, N, 3)``.
         used: ``(*B, V, N)`` bool.
+
+    Returns:
+        0 where fewer than two views are used, or the point or a used camera is not finite.
+
+    Raises:
+        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
+        TypeError: ``proj`` is not floating point, or ``used`` not bool.
     """
     check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
+    check_floating(proj=proj)
     check_bool(used=used)
-    work = solver_dtype(proj)
-    centers = projection_centers(proj.detach().to(work))
-    x, y, z = points.detach().to(work).unbind(dim=-1)
-    return parallax_of(centers, (x, y, z), used.to(work)).to(proj.dtype)
+    batch_shape(proj.shape[:-3], points.shape[:-2], used.shape[:-2])
+    cameras, (places, known) = cameras_of(proj.detach()), _clean_points(points.detach())
+    sick = cameras.sick.unsqueeze(-1) > 0
+    sound = known & ~(sick & used).any(dim=-2)
+    counted = (used & sound.unsqueeze(-2)).to(cameras.proj.dtype)
+    return parallax_of(cameras.centers, places, counted).to(proj.dtype)
 
 
 @without_autocast
 def point_covariance(
-    proj: Tensor, points: Tensor, weights: Tensor, *, pose_covariance: Tensor | None = None
+    proj: Tensor,
+    points: Tensor,
+    weights: Tensor,
+    *,
+    mask: Tensor | None = None,
+    pose_covariance: Tensor | None = None,
 ) -> Tensor:
     r"""First-order covariance ``(*B, N, 3, 3)`` m^2 for pixel noise of 1 / weight px.
 
@@ -65,39 +100,71 @@ def point_covariance(
 
     Args:
         proj: ``(*B, V, 3, 4)``.
-        points: ``(*B, N, 3)`` in the world, metres.
-        weights: ``(*B, V, N)``; 0 = unused.
+        points: ``(*B, N, 3)`` in the world, metres. The (0, 0, 0) of a failed triangulation is a
+            place like any other, and known well if cameras see it: give such points no weight,
+            ``weights * result.valid``, or leave them out, ``mask & result.valid``.
+        weights: ``(*B, V, N)``; 0 = unused, as is less than a millionth of the point's largest.
+        mask: ``(*B, V, N)`` bool, True = used.
         pose_covariance: ``(*B, V, 6, 6)`` of each camera's centre (m) and rotation vector (rad),
             both along the world's axes, independent from view to view; adds what uncertain
             poses do to points that minimise the reprojection error. Taken as
             it is: where it is no covariance (a negative variance), nor is the result.
 
     Returns:
-        0 where fewer than two views see the point. A direction in which nothing is known has a
-        large, finite variance.
+        0 where fewer than two views see the point, or something used is not finite: nothing is
+        stated. A direction in which nothing is known has a large, finite variance. A covariance
+        that does not fit the dtype is its largest number times the identity. What unused views
+        hold (camera, pose) has no effect.
+
+    Raises:
+        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
+        TypeError: ``proj`` is not floating point, or the mask not bool.
 
     Source: Hartley and Zisserman, 2nd ed., sections 5.2 and 5.2.6 (implicit functions).
 
     Example:
+        >>> from deltas_geom import triangulate
         >>> proj = torch.eye(3, 4).repeat(2, 1, 1)
         >>> proj[1, 0, 3] = -1.0  # 1 m to the right; pixels are slopes
-        >>> noise = point_covariance(proj, torch.tensor([[0.5, 0.0, 2.0]]), torch.ones(2, 1))
-        >>> noise.diagonal(dim1=-2, dim2=-1)
-        tensor([[ 2.,  2., 32.]])
+        >>> proj[:, 2, 3] = 1.0  # both 1 m behind the origin
+        >>> pixels = torch.tensor([[[0.25, 0.0], [0.1, 0.0]], [[-0.25, 0.0], [0.1, 0.0]]])
+        >>> found = triangulate(proj, pixels)  # fails for the second, of parallel rays
+        >>> noise = point_covariance(proj, found.points, torch.ones(2, 2) * found.valid)
+        >>> noise.diagonal(dim1=-2, dim2=-1).round(decimals=3)
+        tensor([[ 2.,  2., 32.],
+                [ 0.,  0.,  0.]])
     """
     check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), weights=(weights, "V N"))
-    work = solver_dtype(proj)
-    camera = proj.to(work)
-    x, y, z = points.to(work).unbind(dim=-1)
-    seen = reproject(camera, (x, y, z), weights != 0)
-    squared = weights.to(work).square()
-    found = unpacked3(covariance_of(camera, seen, squared))
+    shapes = [proj.shape[:-3], points.shape[:-2], weights.shape[:-2]]
+    if mask is not None:
+        check_shapes(weights=(weights, "V N"), mask=(mask, "V N"))
+        shapes.append(mask.shape[:-2])
     if pose_covariance is not None:
         check_shapes(proj=(proj, "+V 3 4"), pose_covariance=(pose_covariance, "V 6 6"))
-        noise = pose_covariance.to(work)
-        found = found + _of_poses(camera, points.to(work), seen, squared, found, noise)
-    limit = torch.finfo(proj.dtype).max
-    return found.to(proj.dtype).nan_to_num(limit).clamp(-limit, limit)
+        shapes.append(pose_covariance.shape[:-3])
+    check_floating(proj=proj)
+    check_bool(mask=mask)
+    batch = batch_shape(*shapes)
+    cameras, (places, known) = cameras_of(proj), _clean_points(points)
+    work = cameras.proj.dtype
+    sound, noise = cameras.sick == 0, None
+    if pose_covariance is not None:
+        stated = _fits(pose_covariance.to(work), torch.finfo(work).max ** 0.25)
+        noise = torch.where(stated, pose_covariance, 0.0).to(work)
+        sound = sound & stated[..., 0, 0]
+    like = weights.unsqueeze(-1)
+    weighed = weigh(weights, mask, batch=batch, like=like, sound=sound.unsqueeze(-1))
+    used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
+    seen = reproject(cameras.proj, places, used)
+    of_pixels = unpacked3(covariance_of(cameras.proj, seen, weighed.squared))
+    unit = weighed.largest.squeeze(-2)[..., None, None]
+    # Divided twice: the square of a small weight may be 0.
+    found = of_pixels / unit / unit
+    if noise is not None:
+        # Double where: products of what is as good as infinite would be NaN.
+        finite = torch.where(_fits(of_pixels, torch.finfo(work).max ** 0.75), of_pixels, 0.0)
+        found = found + _of_poses(cameras, places, seen, weighed.squared, finite, noise)
+    return representable(found, proj.dtype)
 
 
 @without_autocast
@@ -108,102 +175,80 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         proj: ``(*B, V, 3, 4)`` K [R | t] with K[2, 2] = 1.
         covariance: ``(*B, N, 3, 3)`` m^2 in the world.
 
+    Returns:
+        In the dtype to which the arguments promote, whose largest number stands for more. 0
+        where the camera or the covariance is not finite.
+
+    Raises:
+        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
+        TypeError: an argument is not floating point.
+
     Example:
         >>> depth_variance(torch.eye(3, 4)[None], torch.diag(torch.tensor([1.0, 2.0, 9.0]))[None])
         tensor([[9.]])
     """
     check_shapes(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
-    proj, covariance = promoted(proj, covariance)
-    axis = proj[..., 2, :3]
-    along = torch.einsum("...vi,...nij->...vnj", axis, covariance)
-    return torch.einsum("...vnj,...vj->...vn", along, axis)
+    check_floating(proj=proj, covariance=covariance)
+    batch_shape(proj.shape[:-3], covariance.shape[:-3])
+    dtype = torch.promote_types(proj.dtype, covariance.dtype)
+    cameras, work = cameras_of(proj), solver_dtype(proj)
+    finite = _fits(covariance, torch.finfo(covariance.dtype).max)
+    spread = torch.where(finite, covariance, 0.0).to(work)
+    with torch.no_grad():
+        size = spread.abs().amax(dim=(-2, -1), keepdim=True)
+        size = torch.where(size > 0, size, 1.0)
+    axis = cameras.proj[..., 2, :3]
+    # Of shares of the largest entry, which may be the largest number that there is.
+    along = torch.einsum("...vi,...nij->...vnj", axis, spread / size)
+    variance = torch.einsum("...vnj,...vj->...vn", along, axis) * size[..., 0].mT
+    limit = torch.finfo(dtype).max
+    return variance.clamp(-limit, limit).to(dtype)
 
 
-class Reprojection(NamedTuple):
-    """Points as views see them.
-
-    Attributes:
-        x: ``(*B, V, N)`` px; 0 where not seen.
-        y: ``(*B, V, N)`` px.
-        inverse: ``(*B, V, N)`` 1 / depth; 0 where not seen.
-        depth: ``(*B, V, N)``.
-        seen: ``(*B, V, N)`` bool, used and in front.
-    """
-
-    x: Tensor
-    y: Tensor
-    inverse: Tensor
-    depth: Tensor
-    seen: Tensor
+def _clean_points(points: Tensor) -> tuple[Vector3, Tensor]:
+    """Points ``(*B, N, 3)`` in the solver's type, 0 where not finite; ``(*B, N)`` are they?"""
+    place = points.mT.to(solver_dtype(points))
+    limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
+    finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
+    # Double where: what is not used must pass no gradient and no NaN.
+    x, y, z = torch.where(finite.unsqueeze(-2), place, 0.0).unbind(dim=-2)
+    return (x, y, z), finite
 
 
-def reproject(proj: Tensor, points: Vector3, used: Tensor) -> Reprojection:
-    """Project points, three ``(*B, N)``, into the used views ``(*B, V, N)``."""
-    x, y, z = (in_views(proj[..., row, :], points) for row in range(3))
-    # Far above the smallest number, so that squares of the inverse are finite.
-    seen = used & (z.detach() > torch.finfo(z.dtype).tiny ** 0.25)
-    inverse = safe_divide(torch.ones_like(z), z, seen)
-    return Reprojection(x * inverse, y * inverse, inverse, z, seen)
+def representable(covariance: Tensor, dtype: torch.dtype) -> Tensor:
+    """Covariances ``(*B, N, 3, 3)`` in a dtype; its largest number times 1 for those beyond it."""
+    limit = torch.finfo(dtype).max
+    largest = limit * torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    # Whole matrices: with entries cut off one by one they would be no covariances.
+    return torch.where(_fits(covariance, limit), covariance, largest).to(dtype)
 
 
-def in_views(row: Tensor, points: Vector3) -> Tensor:
-    """A row ``(*B, V, 4)`` of each camera times points, three ``(*B, N)``: ``(*B, V, N)``."""
-    total = row[..., 3:]
-    for axis, component in enumerate(points):
-        total = torch.addcmul(total, row[..., axis, None], component.unsqueeze(-2))
-    return total
-
-
-def residual_of(found: Reprojection, xy: Tensor, squared: Tensor) -> Tensor:
-    """Weighted RMS distance ``(*B, N)`` px from ``xy``: ``(*B, V, 2, N)``."""
-    x, y = xy.unbind(dim=-2)
-    # Scaled before it is squared: projections may lie anywhere.
-    dx, dy = torch.where(found.seen, found.x - x, 0.0), torch.where(found.seen, found.y - y, 0.0)
-    squared = torch.where(found.seen, squared, 0.0)
-    errors = ((dx * dx + dy * dy) * squared).sum(dim=-2)
-    total = squared.sum(dim=-2)
-    mean = safe_divide(errors, total, total > 0)
-    return safe_sqrt(mean)
-
-
-@torch.no_grad()
-def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
-    """Largest angle ``(*B, N)`` rad between rays from ``(*B, V, 3)`` to the points.
-
-    Args:
-        centers: of the cameras.
-        points: three ``(*B, N)`` in the same frame.
-        used: ``(*B, V, N)`` 1 or 0.
-    """
-    x, y, z = (
-        component.unsqueeze(-2) - center[..., None]
-        for component, center in zip(points, centers.unbind(dim=-1), strict=True)
-    )  # (*B, V, N)
-    tiny = torch.finfo(x.dtype).tiny ** 0.5
-    inverse = torch.rsqrt(torch.addcmul(torch.addcmul(x * x, y, y), z, z).clamp(min=tiny))
-    x, y, z = x * inverse, y * inverse, z * inverse
-    chord = torch.zeros_like(used[..., 0, :])
-    for first in range(used.shape[-2] - 1):
-        one, rest = slice(first, first + 1), slice(first + 1, None)
-        dx, dy, dz = (t[..., one, :] - t[..., rest, :] for t in (x, y, z))
-        apart = torch.addcmul(torch.addcmul(dx * dx, dy, dy), dz, dz)
-        both = used[..., one, :] * used[..., rest, :]
-        chord = torch.maximum(chord, (apart * both).amax(dim=-2))
-    # The chord keeps small angles that the arc cosine of a dot product rounds away.
-    return 2 * torch.asin((0.5 * chord.sqrt()).clamp(max=1))
+def _fits(matrices: Tensor, limit: float) -> Tensor:
+    """Is every entry of ``(..., K, K)`` finite and at most this large? ``(..., 1, 1)``."""
+    within: Tensor = matrices.detach().abs() <= limit  # NaN is not
+    return within.all(dim=-1, keepdim=True).all(dim=-2, keepdim=True)
 
 
 def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetric3:
-    """(sum w^2 J^T J)^-1 of each point, six ``(*B, N)``; 0 below two views."""
+    """(sum w^2 J^T J)^-1 of each point, six ``(*B, N)``; 0 below two views.
+
+    The largest number times the identity where the sum is not within the range of numbers.
+    """
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
     # The derivative of a pixel by the point is its equations, divided by the depth.
-    m00, m01, m02, m11, m12, m22 = normal_matrix(proj[..., :3], found.x, found.y, by_depth)
+    normal = normal_matrix(proj[..., :3], found.x, found.y, by_depth)
     enough = found.seen.sum(dim=-2) >= 2
-    m00, m11, m22 = (torch.where(enough, pivot, 1.0) for pivot in (m00, m11, m22))
-    c00, c01, c02, c11, c12, c22 = (
-        torch.where(enough, entry, 0.0) for entry in inverse3((m00, m01, m02, m11, m12, m22))
-    )
-    return c00, c01, c02, c11, c12, c22
+    with torch.no_grad():
+        trace, limit = normal[0] + normal[3] + normal[5], torch.finfo(by_depth.dtype).max
+        ordinary = enough & (trace > limit**-0.45) & (trace < limit**0.45)
+        unit = torch.where(ordinary, trace, 1.0)
+    # Double where: what has no inverse must pass no gradient and no NaN.
+    xx, xy, xz, yy, yz, zz = (torch.where(ordinary, entry, 0.0) / unit for entry in normal)
+    xx, xy, xz, yy, yz, zz = inverse3((xx, xy, xz, yy, yz, zz))
+    largest = limit * enough.to(unit.dtype)
+    xx, yy, zz = (torch.where(ordinary, entry / unit, largest) for entry in (xx, yy, zz))
+    xy, xz, yz = (torch.where(ordinary, entry / unit, 0.0) for entry in (xy, xz, yz))
+    return xx, xy, xz, yy, yz, zz
 
 
 def unpacked3(entries: Symmetric3) -> Tensor:
@@ -214,8 +259,8 @@ def unpacked3(entries: Symmetric3) -> Tensor:
 
 
 def _of_poses(
-    proj: Tensor,
-    points: Tensor,
+    cameras: Cameras,
+    points: Vector3,
     found: Reprojection,
     squared: Tensor,
     covariance: Tensor,
@@ -227,12 +272,14 @@ def _of_poses(
     would have seen X - d + (X - c) x r.
     """
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
-    view = proj.unsqueeze(-3)  # each view alone, to keep their information apart
+    view = cameras.proj.unsqueeze(-3)  # each view alone, to keep their information apart
     x, y, w = (tensor.unsqueeze(-2) for tensor in (found.x, found.y, by_depth))
     m00, m01, m02, m11, m12, m22 = normal_matrix(view[..., :3], x, y, w)
     information = unpacked3((m00, m01, m02, m11, m12, m22))  # (*B, V, N, 3, 3)
-    offset = points.unsqueeze(-3) - projection_centers(proj).unsqueeze(-2)
-    ox, oy, oz = offset.unbind(dim=-1)
+    ox, oy, oz = (
+        component.unsqueeze(-2) - center.unsqueeze(-1)
+        for component, center in zip(points, cameras.centers.unbind(dim=-1), strict=True)
+    )  # (*B, V, N)
     zero, one = torch.zeros_like(ox), torch.ones_like(ox)
     moved = torch.stack(
         [-one, zero, zero, zero, -oz, oy,

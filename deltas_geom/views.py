@@ -1,12 +1,13 @@
 """Posed views: intrinsics and poses of V cameras that look at one world."""
 
-from typing import NamedTuple, Self
+import operator
+from typing import Any, NamedTuple, Self, SupportsIndex
 
 import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from deltas_geom.checks import ShapeError, check_shapes
+from deltas_geom.checks import ShapeError, batch_shape, check_shapes
 from deltas_geom.pixels import crop_intrinsics, resize_intrinsics
 from deltas_geom.poses import invert_pose, is_rigid
 from deltas_geom.precision import promoted, without_autocast
@@ -14,6 +15,10 @@ from deltas_geom.precision import promoted, without_autocast
 
 class PosedViews(NamedTuple):
     """V pinhole cameras; view 0 is the anchor, the others are its sources.
+
+    Batch dims ``*B`` of K and cam_from_world broadcast, V does not: where all views share one K,
+    pass ``K.expand(V, 3, 3)``. Values are looked at by :meth:`check_values` alone. A named
+    tuple: ``len(views)`` is 2, its fields; V is :attr:`num_views`.
 
     Attributes:
         K: ``(*B, V, 3, 3)`` intrinsics in pixels; pixel centres are integers.
@@ -35,18 +40,30 @@ class PosedViews(NamedTuple):
     @without_autocast
     def proj(self) -> Tensor:
         """Projection matrices K [R | t], ``(*B, V, 3, 4)``, in the dtype to which both promote."""
-        check_shapes(K=(self.K, "V 3 3"), cam_from_world=(self.cam_from_world, "V 4 4"))
+        self.check_shapes()
         K, cam_from_world = promoted(*self)
         return K @ cam_from_world[..., :3, :]
 
     @property
     def num_views(self) -> int:
         """How many views there are, the anchor included."""
+        self.check_shapes()
         return self.K.shape[-3]
 
     @classmethod
     def from_world_from_cam(cls, K: Tensor, world_from_cam: Tensor) -> Self:
-        """From camera-to-world poses, as ScanNet, 7-Scenes and most trackers write them."""
+        """From camera-to-world poses, as ScanNet, 7-Scenes and most trackers write them.
+
+        Args:
+            K: ``(*B, V, 3, 3)`` intrinsics in pixels.
+            world_from_cam: ``(*B, V, 4, 4)`` rigid. A scale in the rotations multiplies every
+                depth, without a word: call :meth:`check_values` once.
+
+        Raises:
+            ShapeError: a trailing shape differs.
+            TypeError: not a tensor.
+        """
+        _check_shapes(K, world_from_cam, "world_from_cam")
         return cls(K, invert_pose(world_from_cam))
 
     @classmethod
@@ -54,7 +71,17 @@ class PosedViews(NamedTuple):
         """From camera-to-world poses with OpenGL axes (x right, y up, z backward).
 
         Blender, NeRF's ``transforms.json`` and ARKit write these. The world stays as it is.
+        Arguments and errors are those of :meth:`from_world_from_cam`; docs/conventions.md has a
+        ``transforms.json`` read whole, K included.
+
+        Example:
+            >>> K = torch.tensor([[[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]])
+            >>> views = PosedViews.from_opengl(K, torch.eye(4)[None])
+            >>> views.check_values()
+            >>> views.cam_from_world[0].diagonal()
+            tensor([ 1., -1., -1.,  1.])
         """
+        _check_shapes(K, world_from_cam, "world_from_cam")
         x, y, z, center = world_from_cam.unbind(dim=-1)
         return cls(K, invert_pose(torch.stack([x, -y, -z, center], dim=-1)))
 
@@ -65,27 +92,56 @@ class PosedViews(NamedTuple):
         Args:
             camera: kornia camera; its extrinsics are camera-from-world as ours.
             num_views: V; without it all cameras are views of one world.
+
+        Raises:
+            ShapeError: no multiple of ``num_views``, or no camera.
+            ValueError: ``num_views`` is below 1.
         """
         K = camera.intrinsics[..., :3, :3]
-        views = num_views or K.shape[0]
-        if K.shape[0] % views:
-            raise ShapeError(f"{K.shape[0]} kornia cameras are no multiple of num_views={views}")
-        batch = () if num_views is None else (K.shape[0] // views,)
+        batch: tuple[int, ...] = ()
+        views = K.shape[0]
+        if num_views is not None:
+            if num_views < 1:
+                raise ValueError(f"num_views must be at least 1, or None for all, got {num_views}")
+            if K.shape[0] % num_views:
+                raise ShapeError(
+                    f"{K.shape[0]} kornia cameras are no multiple of num_views={num_views}"
+                )
+            batch, views = (K.shape[0] // num_views,), num_views
+        elif views == 0:
+            raise ShapeError("camera must hold at least one view, got a kornia camera of none")
         return cls(K.reshape(*batch, views, 3, 3), camera.extrinsics.reshape(*batch, views, 4, 4))
 
     def to_kornia(self, *, image_size: tuple[int, int]) -> PinholeCamera:
-        """As a kornia camera with all leading dims flattened into its one batch dim."""
-        K = self.K.reshape(-1, 3, 3)
+        """As a kornia camera with all leading dims flattened into its one batch dim.
+
+        Args:
+            image_size: (height, width) of the images.
+
+        Raises:
+            ShapeError: K and cam_from_world do not go together.
+        """
+        batch = self.check_shapes()
+        K, cam_from_world = (
+            # The count, not -1: a reshape of nothing cannot infer it.
+            tensor.expand(*batch, *tensor.shape[-3:]).reshape(
+                batch.numel() * tensor.shape[-3], *tensor.shape[-2:]
+            )
+            for tensor in promoted(*self)
+        )
         intrinsics = torch.eye(4, device=K.device, dtype=K.dtype).repeat(K.shape[0], 1, 1)
         intrinsics[:, :3, :3] = K
         height, width = (K.new_full((K.shape[0],), float(size)) for size in image_size)
-        return PinholeCamera(intrinsics, self.cam_from_world.reshape(-1, 4, 4), height, width)
+        return PinholeCamera(intrinsics, cam_from_world, height, width)
 
-    def select(self, index: int | slice | list[int]) -> Self:
-        """The chosen views; an int keeps the view dim (V = 1)."""
-        if isinstance(index, int):
+    def select(self, index: SupportsIndex | slice | list[int]) -> Self:
+        """The chosen views; an integer of any kind keeps the view dim (V = 1)."""
+        self.check_shapes()
+        # Arrays have __index__, too, and a list of one view in an array is no integer.
+        if hasattr(index, "__index__") and getattr(index, "ndim", 0) == 0:
+            view = operator.index(index)
             # Not a list, which is copied to the device and waited for.
-            return type(self)(*(tensor.select(-3, index).unsqueeze(-3) for tensor in self))
+            return type(self)(*(tensor.select(-3, view).unsqueeze(-3) for tensor in self))
         return self._replace(
             K=self.K[..., index, :, :], cam_from_world=self.cam_from_world[..., index, :, :]
         )
@@ -98,15 +154,29 @@ class PosedViews(NamedTuple):
         """The same cameras when their images are cropped: pixel (left, top) becomes (0, 0)."""
         return self._replace(K=crop_intrinsics(self.K, left=left, top=top))
 
-    def to(self, *args: torch.device | torch.dtype | str) -> Self:
-        """Both tensors moved or cast as by :meth:`torch.Tensor.to`."""
-        return self._replace(K=self.K.to(*args), cam_from_world=self.cam_from_world.to(*args))  # type: ignore[call-overload]
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Both tensors moved or cast as by :meth:`torch.Tensor.to`, with its arguments."""
+        return type(self)(*(tensor.to(*args, **kwargs) for tensor in self))
+
+    def check_shapes(self) -> torch.Size:
+        """``*B``, to which K and cam_from_world broadcast.
+
+        Raises:
+            ShapeError: a trailing shape differs, each has another V, or ``*B`` does not broadcast.
+            TypeError: not a tensor.
+        """
+        return _check_shapes(self.K, self.cam_from_world, "cam_from_world")
 
     def check_values(self) -> None:
         """Raise ``ValueError`` unless K is an upper triangular camera and poses are rigid.
 
-        Apart from the operations because looking at values stalls an accelerator.
+        Call it once where cameras are read. It finds what no operation sees: rotations with a
+        scale, a shear or a mirror, a last row that is not (0, 0, 0, 1), K with zeros or negative
+        focal lengths, transposed or not scaled to K[2, 2] = 1, NaN and infinity; and the shapes
+        of :meth:`check_shapes`. Apart from the operations because looking at values stalls an
+        accelerator.
         """
+        self.check_shapes()
         focal = self.K.diagonal(dim1=-2, dim2=-1)[..., :2]
         lower = torch.stack([self.K[..., 1, 0], self.K[..., 2, 0], self.K[..., 2, 1]])
         if not bool(self.K.isfinite().all()) or not bool((focal > 0).all()):
@@ -115,3 +185,28 @@ class PosedViews(NamedTuple):
             raise ValueError("K must be upper triangular with K[2, 2] = 1")
         if not bool(is_rigid(self.cam_from_world).all()):
             raise ValueError("cam_from_world must hold finite rigid transforms (R orthogonal)")
+
+
+def _check_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:
+    """``*B`` of K and ``poses``, whose name is ``name``; raise unless they go together."""
+    if isinstance(K, Tensor) and isinstance(poses, Tensor):
+        cameras = K.shape[-2:] == (3, 3) and poses.shape[-2:] == (4, 4) and poses.ndim > 2
+        if cameras and K.shape[-3:-2] != poses.shape[-3:-2]:
+            _refuse_one_for_all(K, poses, name)
+    check_shapes(**{"K": (K, "V 3 3"), name: (poses, "V 4 4")})
+    return batch_shape(K.shape[:-3], poses.shape[:-3])
+
+
+def _refuse_one_for_all(K: Tensor, poses: Tensor, name: str) -> None:
+    """Raise ``ShapeError`` with the cure where K seems to be one for all views."""
+    views = poses.shape[-3]
+    if K.ndim == 2 or K.shape[-3] == 1:
+        cure = f"K.expand{(*K.shape[:-3], views, 3, 3)}"
+    elif K.shape[:-2] == poses.shape[:-3]:
+        cure = f"K[..., None, :, :].expand{(*K.shape[:-2], views, 3, 3)}"
+    else:
+        return
+    raise ShapeError(
+        f"K must have shape (*B, {views}, 3, 3), as {name} has V = {views}, "
+        f"got {tuple(K.shape)}: for one K of all views pass {cure}"
+    )

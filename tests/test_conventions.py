@@ -1,5 +1,10 @@
 """Each convention of the project, pinned by one test."""
 
+import math
+import re
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,8 +29,10 @@ from deltas_geom import (
     triangulate,
     unproject,
 )
-from deltas_geom.testing import default_intrinsics, forward_motion, rigid
+from deltas_geom.testing import default_intrinsics, forward_motion, rigid, ring
 
+PAGE = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text()
+NERF, DLT = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
 IDENTITY = PosedViews(default_intrinsics()[None], torch.eye(4).double()[None])
 
 
@@ -167,3 +174,46 @@ def test_kornia_cameras_project_and_unproject_as_ours_do() -> None:
     again = PosedViews.from_kornia(theirs)
     assert_close(again.K, K, rtol=0, atol=0)
     assert_close(again.cam_from_world, pose, rtol=0, atol=0)
+
+
+def test_the_snippet_on_nerf_looks_along_minus_z_with_the_angle_from_edge_to_edge() -> None:
+    names: dict[str, object] = {}
+    exec(compile(NERF, "docs/conventions.md", "exec"), names)
+    views, width, height = names["views"], 800, 600
+    assert isinstance(views, PosedViews) and views.num_views == 5
+    side = math.tan(0.6911 / 2)
+    corner = torch.tensor([[side, side * height / width, -1.0]])  # right, up and ahead in OpenGL
+    seen = project(views, torch.cat([corner, corner * torch.tensor([-1.0, -1, 1])])).pixels[0]
+    wanted = torch.tensor([[width - 0.5, -0.5], [-0.5, height - 0.5]])
+    assert_close(seen, wanted, rtol=0, atol=1e-3)  # px
+
+
+def test_the_line_on_projections_up_to_scale_gives_K_R_t() -> None:
+    scene = ring()
+    scales = torch.tensor([2.0, 0.5, 3.0, 0.1]).double()[:, None, None]
+    names = {"proj": scene.views.proj * scales * torch.tensor([1, -1]).repeat(2)[:, None, None]}
+    exec(compile(DLT, "docs/conventions.md", "exec"), names)
+    assert_close(names["proj"], scene.views.proj, rtol=1e-12, atol=1e-9)
+    # What the page says that scales do, and a sign.
+    shifted = scene.pixels + torch.arange(8).reshape(4, 1, 2)
+    weights = torch.ones(scene.pixels.shape[:-1]).double()
+    plain = triangulate(scene.views.proj, shifted, weights).points
+    weighted = triangulate(scene.views.proj, shifted, weights * scales[..., 0]).points
+    scaled = triangulate(scene.views.proj * scales, shifted, weights)
+    # As a weight but for the frame in which the equations are solved.
+    assert (scaled.points - weighted).norm() < 0.1 * (plain - weighted).norm()
+    assert_close(scaled.depth, scales[..., 0] * project(scene.views, scaled.points).depth)
+    behind = triangulate(-scene.views.proj, scene.pixels)
+    assert (behind.status == Status.BEHIND_CAMERA).all()
+
+
+def test_the_line_on_lens_distortion_gives_the_pixels_of_a_pinhole() -> None:
+    (line,) = re.findall(r"`(cv2\.undistortPoints\(.*?\))`", PAGE)
+    scene, dist = forward_motion(), np.array([-0.1, 0.02, 1e-3, -1e-3])
+    K, pose = scene.views.K[0].numpy(), scene.views.cam_from_world[0].numpy()
+    turn, _ = cv2.Rodrigues(pose[:3, :3])
+    pixels, _ = cv2.projectPoints(scene.points.numpy(), turn, pose[:3, 3], K, dist)
+    wanted = scene.pixels[0].numpy()
+    assert np.abs(pixels[:, 0] - wanted).max() > 1
+    straight = eval(line, {"cv2": cv2, "pixels": pixels, "K": K, "dist": dist})
+    np.testing.assert_allclose(straight[:, 0], wanted, rtol=0, atol=0.01)  # px

@@ -32,6 +32,7 @@ ORDER = [
     "null_vector",
     "observations",
     "normal_matrix",
+    "reprojection",
     "uncertainty",
     "rig_frame",
     "equations",

@@ -1,5 +1,6 @@
 """The conformance table: every invariant, every target, and the smallest scene that fails."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -49,31 +50,48 @@ def check(name: str, target: Target) -> Outcome:
 def conformance(targets: Iterable[Target]) -> list[Outcome]:
     """Ask every target for every invariant.
 
+    Raises:
+        ValueError: two targets have one name.
+
     Example:
         >>> from deltas_geom.testing.targets import kornia
         >>> outcomes = conformance([kornia("eigh")])
         >>> [outcome.invariant for outcome in outcomes if outcome.result == "FAIL"]
         ['points_move_with_the_world', ...]
     """
+    targets = list(targets)
+    for name, count in Counter(target.name for target in targets).items():
+        if count > 1:
+            raise ValueError(f"{count} targets are named {name!r}: give each its own name")
     return [check(name, target) for target in targets for name in INVARIANTS]
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """A row an invariant, a column a target, and the failing examples below."""
+    """A row an invariant, a column a target, and the failing examples below.
+
+    A cell is blank where a target was not asked.
+
+    Raises:
+        ValueError: two outcomes are of the same invariant and target.
+    """
+    cells_of = Counter((outcome.invariant, outcome.target) for outcome in outcomes)
+    for (name, target), count in cells_of.items():
+        if count > 1:
+            raise ValueError(f"{count} outcomes of {name} are of targets named {target!r}")
     targets = list(dict.fromkeys(outcome.target for outcome in outcomes))
     results = {(outcome.invariant, outcome.target): outcome.result for outcome in outcomes}
     names = list(dict.fromkeys(outcome.invariant for outcome in outcomes))
     width = max((len(name) for name in names), default=0)
     lines = ["  ".join([" " * width, *targets])]
     for name in names:
-        cells = [results[name, target].center(len(target)) for target in targets]
+        cells = [results.get((name, target), "").center(len(target)) for target in targets]
         lines.append("  ".join([name.replace("_", " ").ljust(width), *cells]).rstrip())
     failed: dict[tuple[str, str], list[str]] = {}
     for outcome in outcomes:
         if outcome.result == "FAIL":
             failed.setdefault((outcome.invariant, outcome.example), []).append(outcome.target)
     for (name, example), who in failed.items():
-        lines += ["", f"{', '.join(who)}: {INVARIANTS[name].theorem}", _indented(example)]
+        lines += ["", f"{', '.join(who)}: {INVARIANTS[name].theorem} ({name})", _indented(example)]
     return "\n".join(lines)
 
 

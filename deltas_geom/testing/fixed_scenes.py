@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from deltas_geom.checks import check_image_size
+from deltas_geom.testing.arguments import check_bounds, check_counts, check_places
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.registry import Invariant
 from deltas_geom.testing.scenes import (
@@ -29,15 +31,21 @@ def seeded_scene(
 
     Args:
         seed: which one; 0 leaves the cameras unturned.
-        num_views: V.
-        num_points: N.
+        num_views: V, 2 or more.
+        num_points: N, 1 or more.
         noise: largest error of a pixel's coordinate, px.
         skew: of all cameras, px.
+
+    Raises:
+        ValueError: too few views or points, or a noise below 0.
 
     Example:
         >>> seeded_scene(0).views.cam_from_world[1, :3, 3]
         tensor([-0.2500,  0.0000,  0.0000], dtype=torch.float64)
     """
+    check_counts(2, num_views=num_views)
+    check_counts(1, num_points=num_points)
+    check_bounds(noise=noise)
     generator = torch.Generator().manual_seed(seed)
     points = _draw(generator, num_points, 3) + torch.tensor([0, 0, 3.5])
     turn = (0.0 if seed == 0 else 0.25) * _draw(generator, num_views, 3)  # rad
@@ -64,6 +72,7 @@ def seeded_map(
         >>> seeded_map(0, stride=(2, 4)).image_size
         (10, 24)
     """
+    check_counts(1, stride=stride, channels=channels, num_pixels=num_pixels)
     generator = torch.Generator().manual_seed(seed)
     height, width = 5 * stride[0], 6 * stride[1]
     size = torch.tensor([width, height])
@@ -82,7 +91,7 @@ def seeded_scores(
 
     Args:
         seed: which one.
-        size: (h, w) of the logits.
+        size: (h, w) of the logits, 2 places or more.
         dims: D of the positions.
         masked: whether every fourth place is masked.
 
@@ -90,6 +99,8 @@ def seeded_scores(
         >>> seeded_scores(0, masked=True).mask
         tensor([[ True,  True, False]])
     """
+    check_places(size)
+    check_counts(1, dims=dims)
     generator = torch.Generator().manual_seed(seed)
     height, width = size
     mask = torch.arange(height * width) % 4 != 2
@@ -114,6 +125,8 @@ def seeded_depths(
         >>> seeded_depths(1, num_points=3).depth
         tensor([3., 1., 2.], dtype=torch.float64)
     """
+    check_counts(1, num_points=num_points)
+    check_image_size(image_size)
     generator = torch.Generator().manual_seed(seed)
     height, width = image_size
     size = torch.tensor([width, height])
@@ -173,8 +186,8 @@ _OTHERS: dict[str, tuple[partial[Any], ...]] = {
 def scenes_for(invariant: Invariant) -> list[partial[Any]]:
     """The fixed scenes of an invariant, smallest first, as the calls that make them."""
     if invariant.scenes == "posed":
-        needed = 3 if "many views" in invariant.needs else 2
-        return [make for make in _POSED if make.keywords.get("num_views", 2) >= needed]
+        least = invariant.least_views
+        return [make for make in _POSED if make.keywords.get("num_views", 2) >= least]
     if invariant.scenes == "ties":
         return [partial(make, dtype=torch.float64) for make in (right_angle, ring)]
     if invariant.scenes == "named":

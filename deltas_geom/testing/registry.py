@@ -2,16 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from typing import Literal
 
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.scenes import PosedScene
-from deltas_geom.testing.target import Target
+from deltas_geom.testing.target import Target, fields_of
 
 Scene = PosedScene | MapScene | ScoreScene | DepthScene
 """What invariants are asked on; one kind each."""
 
 SceneKind = Literal["posed", "named", "ties", "segments", "maps", "scores", "depths"]
+_PLANAR: dict[str, type[Scene]] = {"maps": MapScene, "scores": ScoreScene, "depths": DepthScene}
 
 
 @dataclass(frozen=True)
@@ -35,15 +37,40 @@ class Invariant:
         """One sentence."""
         return " ".join((self.check.__doc__ or "").split("\n\n")[0].split())
 
+    @property
+    def least_views(self) -> int:
+        """How many views a scene with cameras must have: 1 for a projection, 2 or 3 for others."""
+        if "many views" in self.needs:
+            return 3
+        return 1 if self.needs == ("project",) else 2
+
     def offered_by(self, target: Target) -> bool:
         """Whether the target has what is needed."""
         return all(target.offers(feature) for feature in self.needs)
 
     def __call__(self, target: Target, scene: Scene, **choices: object) -> None:
-        """Check it in the views of the scene that the target can take."""
+        """Check it in the views of the scene that the target can take.
+
+        Raises:
+            AssertionError: the invariant does not hold; with the failing numbers.
+            TypeError: a scene of another kind, or a function of the target returns no tensor.
+            ValueError: the target does not offer what is needed, or the scene has too few views.
+        """
+        name = self.check.__name__
+        if not isinstance(target, Target):
+            raise TypeError(f"{name} takes a Target, got {type(target).__name__}")
+        for feature in self.needs:
+            if not target.offers(feature):
+                raise ValueError(f"{name} needs {fields_of(feature)}: {target.name} lacks it")
+        kind = _PLANAR.get(self.scenes, PosedScene)
+        if not isinstance(scene, kind):
+            raise TypeError(f"{name} takes a {kind.__name__}, got {type(scene).__name__}")
         if isinstance(scene, PosedScene):
+            views = scene.views.num_views
+            if views < self.least_views:
+                raise ValueError(f"{name} needs a scene of {self.least_views} views, got {views}")
             scene = first_views(scene, target.max_views)
-        self.check(target, scene, **choices)
+        self.check(target.checked(), scene, **choices)
 
 
 INVARIANTS: dict[str, Invariant] = {}
@@ -53,7 +80,7 @@ INVARIANTS: dict[str, Invariant] = {}
 def invariant(
     *needs: str, scenes: SceneKind = "posed"
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorator that puts a check into ``INVARIANTS``, under its own name.
+    """Decorator that puts a check into ``INVARIANTS``, under its own name, and asks through it.
 
     Args:
         *needs: features that a target must offer.
@@ -61,8 +88,13 @@ def invariant(
     """
 
     def register(check: Callable[..., None]) -> Callable[..., None]:
-        INVARIANTS[check.__name__] = Invariant(check, needs, scenes)
-        return check
+        made = INVARIANTS[check.__name__] = Invariant(check, needs, scenes)
+
+        @wraps(check)
+        def ask(target: Target, scene: Scene, **choices: object) -> None:
+            made(target, scene, **choices)
+
+        return ask
 
     return register
 

@@ -1,7 +1,8 @@
 """Hypothesis strategies that draw geometry, so that a failure shrinks to a scene.
 
 Everything drawn is well posed by construction: no test needs to filter. Tensors are float64
-on the CPU; cast them in the test.
+on the CPU; cast them in the test. An argument for which there is no such scene raises
+``ValueError``, as hypothesis does it: when the first one is drawn.
 """
 
 import torch
@@ -14,11 +15,16 @@ except ImportError as error:  # pragma: no cover
         "deltas_geom.testing.strategies needs hypothesis: pip install 'deltas-depth[test]'"
     ) from error
 
+from deltas_geom.checks import check_image_size
 from deltas_geom.projection import unproject
+from deltas_geom.testing.arguments import check_bounds, check_counts, check_places
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene, rigid, scene_from
 from deltas_geom.testing.target import DepthRange
 from deltas_geom.views import PosedViews
+
+_DECADES = 307.0  # beyond, a power of 10 is infinite or loses digits in float64
+_MOST_VIEWS = 20
 
 
 @st.composite
@@ -31,6 +37,9 @@ def vectors(draw: st.DrawFn, count: int, *, within: float, size: int = 3) -> Ten
         within: bound of each coordinate, in the caller's unit.
         size: coordinates of a vector.
     """
+    check_counts(0, count=count)
+    check_counts(1, size=size)
+    check_bounds(within=within)
     # Multiples of a 1/1024 of the bound shrink to short numbers and never underflow.
     steps = st.integers(-1024, 1024)
     drawn = draw(st.lists(steps, min_size=count * size, max_size=count * size))
@@ -40,12 +49,14 @@ def vectors(draw: st.DrawFn, count: int, *, within: float, size: int = 3) -> Ten
 @st.composite
 def scales(draw: st.DrawFn, *, decades: float = 3.0) -> float:
     """A positive factor between 10^-decades and 10^decades, evenly over the logarithm."""
+    check_bounds(_DECADES, decades=decades)
     return float(10.0 ** draw(st.floats(-decades, decades)))
 
 
 @st.composite
 def intrinsics(draw: st.DrawFn, num_views: int = 1) -> Tensor:
     """``(V, 3, 3)`` cameras of 640 x 480 pixels: focal lengths 400 to 600 px, some skew."""
+    check_counts(1, num_views=num_views)
     height, width = IMAGE_SIZE
     change = draw(vectors(num_views, within=1.0, size=5))
     K = torch.zeros(num_views, 3, 3, dtype=torch.float64)
@@ -68,6 +79,8 @@ def poses(draw: st.DrawFn, num_views: int = 1, *, turn: float = 0.2, shift: floa
         turn: bound of each component of axis times angle, rad.
         shift: bound of each coordinate of the translation, metres.
     """
+    check_counts(1, num_views=num_views)
+    check_bounds(turn=turn, shift=shift)
     return rigid(draw(vectors(num_views, within=turn)), draw(vectors(num_views, within=shift)))
 
 
@@ -84,7 +97,17 @@ def cameras(draw: st.DrawFn, num_views: int = 2) -> PosedViews:
 
 @st.composite
 def posed_scenes(draw: st.DrawFn, num_views: int = 2, num_points: int = 4) -> PosedScene:
-    """Views 9 cm or more apart, every point 1.8 m or more ahead of each."""
+    """Views 9 cm or more apart, every point 1.8 m or more ahead of each (of 5 or more: 1 m).
+
+    Args:
+        draw: given by hypothesis.
+        num_views: V, 2 to 20. Of more, the last in the row would look away from the points.
+        num_points: N, 1 or more.
+    """
+    check_counts(2, num_views=num_views)
+    check_counts(1, num_points=num_points)
+    if num_views > _MOST_VIEWS:
+        raise ValueError(f"num_views must be {_MOST_VIEWS} or less, got {num_views}")
     views = draw(cameras(num_views))
     ahead = torch.tensor([0.0, 0.0, 3.5], dtype=torch.float64)
     return scene_from(views, draw(vectors(num_points, within=1.0)) + ahead)
@@ -92,10 +115,13 @@ def posed_scenes(draw: st.DrawFn, num_views: int = 2, num_points: int = 4) -> Po
 
 @st.composite
 def rigs(draw: st.DrawFn, num_points: int = 3) -> PosedScene:
-    """Two views within a metre, turned by up to a radian, and keypoints anywhere in the first.
+    """Two views, turned by up to a radian and moved by up to a metre each against the world.
+
+    Keypoints are anywhere in the first.
 
     The points are those 4 m ahead of the keypoints; the second view need not see them.
     """
+    check_counts(1, num_points=num_points)
     views = PosedViews(draw(intrinsics(2)), draw(poses(2, turn=0.6, shift=0.5)))
     keypoints = draw(image_pixels(num_points))
     depth = torch.full((1, num_points), 4.0, dtype=torch.float64)
@@ -114,8 +140,10 @@ def epipole_rigs(draw: st.DrawFn, num_points: int = 1, *, within: float = 0.0) -
         draw: given by hypothesis.
         num_points: N.
         within: px, how far each coordinate of the first keypoint may be from the epipole; the
-            last is up to a million times nearer.
+            last of several is up to a million times nearer.
     """
+    check_counts(1, num_points=num_points)
+    check_bounds(within=within)
     K = draw(intrinsics(2))
     pose = draw(poses(2, turn=0.3, shift=0.5))
     epipole = draw(image_pixels(1))
@@ -145,6 +173,8 @@ def image_pixels(
     draw: st.DrawFn, count: int, *, image_size: tuple[int, int] = IMAGE_SIZE
 ) -> Tensor:
     """``(count, 2)`` pixels anywhere in an image, its edges included."""
+    check_counts(0, count=count)
+    check_image_size(image_size)
     height, width = image_size
     size = torch.tensor([width, height], dtype=torch.float64)
     return (draw(vectors(count, within=0.5, size=2)) + 0.5) * size - 0.5
@@ -153,6 +183,8 @@ def image_pixels(
 @st.composite
 def extreme(draw: st.DrawFn, *shape: int, decades: float = 30.0) -> Tensor:
     """Finite numbers of any sign and of magnitude 10^-decades to 10^decades, and zero."""
+    check_counts(0, shape=shape)
+    check_bounds(_DECADES, decades=decades)
     count = 1
     for size in shape:
         count *= size
@@ -166,7 +198,16 @@ def extreme(draw: st.DrawFn, *shape: int, decades: float = 30.0) -> Tensor:
 def map_scenes(
     draw: st.DrawFn, cells: tuple[int, int] = (3, 4), channels: int = 2, num_pixels: int = 5
 ) -> MapScene:
-    """A map of an image in cells of 1 to 8 px on a side, and pixels anywhere in the image."""
+    """A map of an image in cells of 1 to 8 px on a side, and pixels anywhere in the image.
+
+    Args:
+        draw: given by hypothesis.
+        cells: (h, w) of the map, each 2 or more: invariants crop a row and a column of it.
+        channels: D, 1 or more.
+        num_pixels: N, 1 or more.
+    """
+    check_counts(2, cells=cells)
+    check_counts(1, channels=channels, num_pixels=num_pixels)
     height, width = cells
     strides = st.sampled_from([1, 2, 4, 8])
     image_size = (height * draw(strides), width * draw(strides))
@@ -180,7 +221,15 @@ def map_scenes(
 
 @st.composite
 def score_scenes(draw: st.DrawFn, size: tuple[int, int] = (2, 4), dims: int = 2) -> ScoreScene:
-    """Logits between -5 and 5 of places within 10, some of them masked, never all."""
+    """Logits between -5 and 5 of places within 10, some of them masked, never all.
+
+    Args:
+        draw: given by hypothesis.
+        size: (h, w) of the logits, 2 places or more.
+        dims: D of the positions, 1 or more.
+    """
+    check_places(size)
+    check_counts(1, dims=dims)
     count = size[0] * size[1]
     mask = torch.tensor(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
     mask[draw(st.integers(0, count - 1))] = True
@@ -193,6 +242,8 @@ def depth_scenes(
     draw: st.DrawFn, num_points: int = 8, image_size: tuple[int, int] = (4, 5)
 ) -> DepthScene:
     """Pixels in and around a tiny image, so that they collide; depths of 1, 2, ... m; weights."""
+    check_counts(1, num_points=num_points)
+    check_image_size(image_size)
     order = draw(st.permutations(range(num_points)))
     return DepthScene(
         1.2 * draw(image_pixels(num_points, image_size=image_size)),

@@ -1,7 +1,8 @@
 """What an implementation under test offers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from torch import Tensor
 
@@ -15,6 +16,38 @@ Sampler = Callable[
     [Tensor, Tensor, Tensor, DepthRange, ImageSize, int], tuple[Tensor, Tensor, Tensor]
 ]
 Drawer = Callable[[Tensor, Tensor, Tensor, ImageSize], tuple[Tensor, Tensor]]
+
+_SAMPLES = ("pixels (N, S, 2)", "inv_depth (N, S)", "status (N)")
+_IMAGES = ("depth (H, W)", "weight (H, W)")
+_RETURNS: dict[str, tuple[str, ...]] = {
+    "project": ("pixels (V, N, 2)",),
+    "fundamental": ("F (3, 3)",),
+    "triangulate": ("points (N, 3)",),
+    "judge": ("status (N)",),
+    "refine": ("points (N, 3)",),
+    "segments": ("far (N, 2)", "near (N, 2)", "status (N)"),
+    "depth_samples": _SAMPLES,
+    "pixel_samples": _SAMPLES,
+    "sweep": ("pixels (N, S, 2)", "visible (N, S) bool"),
+    "sample_map": ("features (N, D)",),
+    "correlate": ("scores (N, S)",),
+    "soft_argmax": ("position (D)",),
+    "soft_covariance": ("covariance (D, D)",),
+    "heatmap_argmax": ("pixel (2)",),
+    "rasterize": ("depth (H, W)",),
+    "mean_depth": _IMAGES,
+    "splat": _IMAGES,
+}
+_SOLVERS = "triangulate, judge or refine"
+_MADE_OF = {
+    "weights": f"weighted=True and {_SOLVERS}",
+    "gradients": "triangulate and differentiable=True",
+    "batches": "triangulate and batched=True",
+    "many views": f"max_views of 3 or more, or None, and {_SOLVERS}",
+    "samples": "depth_samples or pixel_samples",
+    "drawing": "rasterize, mean_depth or splat",
+}
+"""The fields behind each feature that is not one function."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +100,10 @@ class Target:
             weight (H, W))``: weighted mean and summed weight of each pixel's points.
         splat: the same, each point shared among its four neighbours bilinearly.
 
+    Raises:
+        TypeError: what has to be a function, or True or False, is something else.
+        ValueError: ``max_views`` is less than 2.
+
     Example:
         >>> from deltas_geom.triangulation import triangulate_points
         >>> mine = Target("mine", triangulate=triangulate_points, max_views=2, weighted=False)
@@ -100,6 +137,18 @@ class Target:
     splat: Drawer | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise TypeError(f"name must be a str, got {type(self.name).__name__}")
+        for field in _RETURNS:
+            function = getattr(self, field)
+            if function is not None and not callable(function):
+                kind = type(function).__name__
+                raise TypeError(f"{field} must be a function or None, got {kind}")
+        for field in ("weighted", "differentiable", "batched"):
+            if not isinstance(getattr(self, field), bool):
+                raise TypeError(f"{field} must be True or False, got {getattr(self, field)!r}")
+        if self.max_views is not None and not isinstance(self.max_views, int):
+            raise TypeError(f"max_views must be whole, or None, got {self.max_views!r}")
         if self.max_views is not None and self.max_views < 2:
             raise ValueError(f"max_views must be 2 or more, or None, got {self.max_views}")
 
@@ -125,3 +174,43 @@ class Target:
             return more[feature]
         function: object = getattr(self, feature)
         return function is not None
+
+    def checked(self) -> "Target":
+        """The same, whose functions raise ``TypeError`` unless they return tensors, as they must.
+
+        Example:
+            >>> import torch
+            >>> listed = Target("mine", heatmap_argmax=lambda logits: [0.0, 0.0])
+            >>> listed.checked().heatmap_argmax(torch.zeros(2, 3))
+            Traceback (most recent call last):
+            ...
+            TypeError: mine: heatmap_argmax must return a torch.Tensor, pixel (2), got list
+        """
+        functions: dict[str, Any] = {
+            field: _checked(f"{self.name}: {field}", getattr(self, field), wanted)
+            for field, wanted in _RETURNS.items()
+            if getattr(self, field) is not None
+        }
+        return replace(self, **functions)
+
+
+def fields_of(feature: str) -> str:
+    """What a target has to be given for a feature of :meth:`Target.offers`, in words."""
+    return _MADE_OF.get(feature, feature)
+
+
+def _checked(
+    where: str, function: Callable[..., object], wanted: tuple[str, ...]
+) -> Callable[..., object]:
+    def call(*arguments: object) -> object:
+        found = function(*arguments)
+        several = len(wanted) > 1 and isinstance(found, tuple | list)
+        parts = list(found) if several else [found]  # type: ignore[call-overload]
+        if len(parts) != len(wanted) or not all(isinstance(part, Tensor) for part in parts):
+            kinds = ", ".join(type(part).__name__ for part in parts)
+            got = f"({kinds})" if several else kinds
+            what = "a torch.Tensor" if len(wanted) == 1 else f"{len(wanted)} torch.Tensors"
+            raise TypeError(f"{where} must return {what}, {', '.join(wanted)}, got {got}")
+        return found
+
+    return call

@@ -2,21 +2,36 @@
 
 import re
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import find, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 import deltas_geom
 from deltas_geom import ShapeError, Status, triangulate_points
-from deltas_geom.testing import DEGENERATE_SCENES, PosedScene, forward_motion, rigid
+from deltas_geom.homogeneous import to_homogeneous
+from deltas_geom.poses import camera_centers
+from deltas_geom.testing import (
+    DEGENERATE_SCENES,
+    PosedScene,
+    forward_motion,
+    rigid,
+    seeded_depths,
+    seeded_map,
+    seeded_scene,
+    seeded_scores,
+    strategies,
+)
 from deltas_geom.testing.__main__ import main
 from deltas_geom.testing.agreement import assert_near, assert_status
-from deltas_geom.testing.conformance import check, conformance, scenes_for, seeded_scene, table
+from deltas_geom.testing.conformance import Outcome, check, conformance, scenes_for, table
 from deltas_geom.testing.invariants import INVARIANTS, World, first_views
 from deltas_geom.testing.planar import MapScene, ScoreScene
 from deltas_geom.testing.strategies import map_scenes, posed_scenes, scales, score_scenes, vectors
@@ -33,6 +48,8 @@ from deltas_geom.testing.targets import (
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "testing.md"
 OURS = deltas()
+FUNCTIONS = [field.name for field in fields(Target) if callable(getattr(OURS, field.name))]
+PLANAR = ("maps", "scores", "depths")
 SOLVING = {"triangulate", "gradients", "batches", "judge", "refine"}
 POSED = [name for name, invariant in INVARIANTS.items() if invariant.scenes == "posed"]
 SOLVED = [name for name in POSED if SOLVING & {*INVARIANTS[name].needs}]
@@ -149,6 +166,190 @@ def test_an_exception_of_the_target_is_its_failure() -> None:
     assert outcome.result == "FAIL" and "ShapeError: no such shape" in outcome.example
 
 
+def test_targets_of_one_name_are_refused() -> None:
+    broken = Target("t", rasterize=lambda p, z, size: torch.full(size, torch.nan).double())
+    good = replace(OURS, name="t")
+    with pytest.raises(ValueError, match="2 targets are named 't': give each its own name"):
+        conformance(iter([broken, good]))
+    outcomes = [check("depth_images_are_finite", target) for target in (broken, good)]
+    assert [outcome.result for outcome in outcomes] == ["FAIL", "pass"]
+    with pytest.raises(ValueError, match="2 outcomes of depth_images_are_finite are of targets"):
+        table(outcomes)
+    row = table([outcomes[0], Outcome("depth_images_are_finite", "other", "pass")]).splitlines()[1]
+    assert row.split() == ["depth", "images", "are", "finite", "FAIL", "pass"]
+    # A part of the table: blank where nothing was asked.
+    part = table(
+        [Outcome("pixels_are_finite", "a", "pass"), Outcome("points_are_finite", "b", "-")]
+    )
+    assert [line.split()[3:] for line in part.splitlines()[1:]] == [["pass"], ["-"]]
+
+
+@pytest.mark.parametrize("name", INVARIANTS)
+def test_an_invariant_names_the_field_that_the_target_lacks(name: str) -> None:
+    invariant = INVARIANTS[name]
+    module = sys.modules[invariant.check.__module__]
+    bare: Any = triangulate_points
+    for ask in (invariant, getattr(module, name)):
+        scene = scenes_for(invariant)[0]()
+        with pytest.raises(ValueError, match=f"^{name} needs .*: x lacks it$") as raised:
+            ask(Target("x"), scene)
+        words = {*re.findall(r"\w+", str(raised.value).removeprefix(f"{name} needs "))}
+        assert words & {field.name for field in fields(Target)} - {"name"}
+        other = forward_motion() if invariant.scenes in PLANAR else seeded_depths(0)
+        with pytest.raises(TypeError, match=f"^{name} takes a .*Scene, got {type(other).__name__}"):
+            ask(OURS, other)
+        with pytest.raises(TypeError, match=f"^{name} takes a Target, got function$"):
+            ask(bare, scene)
+
+
+def test_an_invariant_names_the_flag_that_the_target_has_off() -> None:
+    scene = seeded_scene(0, num_views=3)
+    cases: tuple[tuple[str, str, dict[str, Any]], ...] = (
+        ("only_the_ratios_of_weights_count", "weighted=True", {"weighted": False}),
+        ("gradients_are_finite_differences", "differentiable=True", {"differentiable": False}),
+        ("a_batch_of_scenes_is_solved_as_each_alone", "batched=True", {"batched": False}),
+        ("a_view_of_weight_0_is_a_view_removed", "max_views of 3 or more", {"max_views": 2}),
+    )
+    for name, flag, off in cases:
+        INVARIANTS[name](OURS, scene)
+        with pytest.raises(ValueError, match=f"{name} needs .*{flag}"):
+            INVARIANTS[name](replace(OURS, **off), scene)
+
+
+def test_an_invariant_refuses_a_scene_of_too_few_views() -> None:
+    # With a view less, nothing is left to solve: the target would be blamed.
+    with pytest.raises(ValueError, match="needs a scene of 3 views, got 2"):
+        INVARIANTS["a_view_of_weight_0_is_a_view_removed"](OURS, seeded_scene(0))
+    one = first_views(seeded_scene(0), 1)
+    with pytest.raises(ValueError, match="needs a scene of 2 views, got 1"):
+        INVARIANTS["points_are_exact_without_noise"](OURS, one)
+    INVARIANTS["pixels_are_those_of_the_camera_equations"](OURS, one)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_field_is_a_function_and_returns_tensors(name: str) -> None:
+    no_function: dict[str, Any] = {name: 3}
+    with pytest.raises(TypeError, match=f"^{name} must be a function or None, got int$"):
+        Target("x", **no_function)
+    function = getattr(OURS, name)
+
+    def in_numpy(*arguments: Any) -> Any:
+        found = function(*arguments)
+        several = isinstance(found, tuple)
+        return tuple(part.numpy() for part in found) if several else found.numpy()
+
+    def too_many(*arguments: Any) -> Any:
+        found = function(*arguments)
+        return (*found, found[0]) if isinstance(found, tuple) else (found, found)
+
+    asked = [known for known in INVARIANTS if name in INVARIANTS[known].needs]
+    asked += ["samples_are_finite"] * name.endswith("samples")
+    asked += ["depth_images_are_finite"] * (name in ("mean_depth", "splat"))
+    for known, (wrong, got) in product(
+        asked, ((in_numpy, r"\(?ndarray"), (too_many, r"(tuple|\(Tensor, )"))
+    ):
+        scene = scenes_for(INVARIANTS[known])[0]()
+        target = replace(OURS, **{name: wrong})
+        with pytest.raises(TypeError, match=f"^deltas: {name} must return .*Tensor.*, got {got}"):
+            INVARIANTS[known](target, scene)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("weighted", None), ("differentiable", 1), ("batched", "no"), ("max_views", 2.5), ("name", 3)],
+)
+def test_a_field_of_another_type_is_refused(field: str, value: Any) -> None:
+    with pytest.raises(TypeError, match=f"^{field} must be "):
+        replace(OURS, **{field: value})
+
+
+@pytest.mark.parametrize(
+    ("strategy", "argument"),
+    [
+        (posed_scenes(num_views=0), "num_views"),
+        (posed_scenes(num_views=1), "num_views"),
+        (posed_scenes(num_views=21), "num_views"),
+        (posed_scenes(num_points=0), "num_points"),
+        (strategies.cameras(0), "num_views"),
+        (strategies.intrinsics(0), "num_views"),
+        (strategies.poses(0), "num_views"),
+        (strategies.poses(turn=-0.1), "turn"),
+        (strategies.poses(shift=torch.inf), "shift"),
+        (strategies.rigs(0), "num_points"),
+        (strategies.epipole_rigs(0), "num_points"),
+        (strategies.epipole_rigs(within=-1.0), "within"),
+        (strategies.image_pixels(-1), "count"),
+        (strategies.image_pixels(1, image_size=(0, 3)), "image_size"),
+        (strategies.extreme(-1), "shape"),
+        (strategies.extreme(2, decades=400), "decades"),
+        (scales(decades=-1), "decades"),
+        (scales(decades=400), "decades"),
+        (vectors(-1, within=1.0), "count"),
+        (vectors(1, within=1.0, size=0), "size"),
+        (vectors(1, within=torch.nan), "within"),
+        (map_scenes(cells=(1, 4)), "cells"),
+        (map_scenes(channels=0), "channels"),
+        (map_scenes(num_pixels=0), "num_pixels"),
+        (score_scenes(size=(1, 1)), "size"),
+        (score_scenes(size=(0, 4)), "size"),
+        (score_scenes(dims=0), "dims"),
+        (strategies.depth_scenes(0), "num_points"),
+        (strategies.depth_scenes(image_size=(4, 0)), "image_size"),
+    ],
+)
+def test_what_cannot_be_drawn_well_posed_is_refused(
+    strategy: st.SearchStrategy[object], argument: str
+) -> None:
+    with pytest.raises(ValueError, match=f"^{argument} must "):
+        find(strategy, lambda drawn: True)
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments"),
+    [
+        (seeded_scene, {"num_views": 1}),
+        (seeded_scene, {"num_points": 0}),
+        (seeded_scene, {"noise": -1.0}),
+        (seeded_map, {"stride": (0, 1)}),
+        (seeded_map, {"channels": 0}),
+        (seeded_map, {"num_pixels": 0}),
+        (seeded_scores, {"size": (1, 1)}),
+        (seeded_scores, {"dims": 0}),
+        (seeded_depths, {"num_points": 0}),
+        (seeded_depths, {"image_size": (0, 2)}),
+    ],
+)
+def test_a_seeded_scene_with_nothing_in_it_is_refused(
+    make: Callable[..., object], arguments: dict[str, object]
+) -> None:
+    (name,) = arguments
+    with pytest.raises(ValueError, match=f"^{name} must "):
+        make(0, **arguments)
+    if name != "noise" and not isinstance(arguments[name], tuple):
+        with pytest.raises(TypeError, match=f"^{name} must be whole, got 2.5$"):
+            make(0, **{name: 2.5})
+
+
+@given(data=st.data(), num_views=st.sampled_from([2, 3, 4, 5, 20]))
+def test_drawn_scenes_are_as_well_posed_as_they_say(data: st.DataObject, num_views: int) -> None:
+    scene = data.draw(posed_scenes(num_views, 3))
+    depth = (to_homogeneous(scene.points) @ scene.views.proj.mT)[..., 2]
+    assert float(depth.min()) > (1.8 if num_views <= 4 else 1.0)
+    centers = camera_centers(scene.views.cam_from_world)
+    assert float(centers.diff(dim=0).norm(dim=-1).min()) > 0.09
+
+
+def test_the_least_depth_of_drawn_scenes_is_what_they_say() -> None:
+    # The worst turn of the last camera of a row, and the worst corner of the box of points.
+    steps = torch.linspace(-0.2, 0.2, 9).double()
+    turn = torch.cartesian_prod(steps, steps, steps)
+    ahead = rigid(turn, torch.zeros_like(turn))[:, 2, :3]
+    for num_views, wanted in ((4, 1.8), (20, 1.0)):
+        middle = torch.tensor([-0.2 * (num_views - 1), 0, 3.5]).double()
+        depth = ahead @ middle - 1.04 * ahead.abs().sum(dim=-1)
+        assert wanted < float(depth.min()) < wanted + 0.2
+
+
 def test_every_invariant_states_its_theorem() -> None:
     for invariant in INVARIANTS.values():
         assert re.fullmatch(r"[A-Zx].*\.", invariant.theorem)
@@ -195,7 +396,7 @@ def test_one_failing_example_is_printed_once_for_all_who_share_it() -> None:
 def test_the_example_is_a_call_that_can_be_pasted() -> None:
     example = check("points_move_with_the_world", opencv()).example
     call = example.split(": ")[0]
-    scene = eval(call, {"seeded_scene": seeded_scene})
+    scene = eval(call, vars(deltas_geom.testing))
     with pytest.raises(AssertionError, match=r"off by 0\.00054, allowed 1e-06 m"):
         INVARIANTS["points_move_with_the_world"](opencv(), scene)
 
@@ -243,14 +444,20 @@ def test_an_empty_table_is_no_error() -> None:
     assert table([]).strip() == ""
 
 
-def test_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    (snippet,) = re.findall(r"^```python\n(.*?)^```$", DOCS.read_text(), re.DOTALL | re.MULTILINE)
-    exec(compile(snippet, "docs/testing.md", "exec"), {"__name__": "page"})
-    failed = {*re.findall(r"^(.*?) +FAIL", capsys.readouterr().out, re.MULTILINE)}
-    named = re.findall(r"`([^`]* [^`]*)`", DOCS.read_text().split("Here: ")[1].split("| kind")[0])
-    assert len(named) == 3 and {name.replace("\n", " ") for name in named} <= failed
-    assert "gradients are finite differences at ties" in failed
-    assert "points are exact without noise" not in failed
+def test_the_page_runs_and_lists_what_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    example, again = _blocks("python")
+    namespace = {"__name__": "page"}
+    exec(compile(example, "docs/testing.md", "exec"), namespace)
+    printed = capsys.readouterr().out
+    failed = {*re.findall(r"^(\S.*?) +FAIL", printed, re.MULTILINE)}
+    listed = DOCS.read_text().split("Here these fail:")[1].split("Below the table")[0]
+    assert {*re.findall(r"`([^`]+)`", listed)} == failed
+    shown, _ = _blocks("text")
+    # The last digits are those of one machine.
+    short = re.sub(r"(\d\.\d{4})\d+", r"\1", shown)
+    assert short in re.sub(r"(\d\.\d{4})\d+", r"\1", printed) + "\n"
+    with pytest.raises(AssertionError, match=r"off by 0\.00055, allowed 1e-06 m"):
+        exec(compile(again, "docs/testing.md", "exec"), namespace)
 
 
 def test_the_page_on_geometry_runs_and_names_what_there_is() -> None:
@@ -262,7 +469,13 @@ def test_the_page_on_geometry_runs_and_names_what_there_is() -> None:
 
 
 def test_the_page_has_every_row() -> None:
-    (page,) = re.findall(r"^```text\n(.*?)^```$", DOCS.read_text(), re.DOTALL | re.MULTILINE)
+    _, page = _blocks("text")
     # Other columns may change with the versions of others.
     rows = [re.split(r"\s{2,}", line)[:2] for line in page.splitlines()[1:]]
     assert rows == [[name.replace("_", " "), "pass"] for name in INVARIANTS]
+
+
+def _blocks(language: str) -> list[str]:
+    """The page's blocks of code in a language."""
+    pattern = rf"^```{language}\n(.*?)^```$"
+    return re.findall(pattern, DOCS.read_text(), re.DOTALL | re.MULTILINE)

@@ -36,6 +36,10 @@ def test_wrong_shapes_are_named() -> None:
         epipolar_lines(torch.zeros(3, 4), torch.zeros(5, 2))
     with pytest.raises(ShapeError, match="second has N = 4 but first has N = 5"):
         epipolar_distance(torch.zeros(3, 3), torch.zeros(5, 2), torch.zeros(4, 2))
+    with pytest.raises(ShapeError, match=r"must broadcast, got \(3,\), \(2,\)"):
+        epipolar_lines(torch.zeros(3, 3, 3), torch.zeros(2, 5, 2))
+    with pytest.raises(ShapeError, match=r"must broadcast, got \(\), \(3,\), \(2,\)"):
+        epipolar_distance(torch.zeros(3, 3), torch.zeros(3, 5, 2), torch.zeros(2, 5, 2))
 
 
 def test_batch_dims_broadcast(dtype: torch.dtype) -> None:

@@ -93,10 +93,10 @@ def median_error(result: Triangulation, points: Tensor) -> float:
 def test_wrong_arguments_are_named(solve: Solver) -> None:
     with pytest.raises(ShapeError, match="rays has V = 3 but cam_from_world has V = 2"):
         solve(torch.eye(4).expand(2, 4, 4), torch.zeros(3, 5, 3))
-    with pytest.raises(ShapeError, match="rays has N = 5 but weights has N = 4"):
+    with pytest.raises(ShapeError, match="weights has N = 4 but rays has N = 5"):
         solve(torch.eye(4).expand(2, 4, 4), torch.zeros(2, 5, 3), torch.ones(2, 4))
     mask = torch.ones(1, 5, dtype=torch.bool)
-    with pytest.raises(ShapeError, match="rays has V = 2 but mask has V = 1"):
+    with pytest.raises(ShapeError, match="mask has V = 1 but rays has V = 2"):
         solve(torch.eye(4).expand(2, 4, 4), torch.zeros(2, 5, 3), mask=mask)
 
 

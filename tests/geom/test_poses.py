@@ -15,6 +15,15 @@ def test_a_pose_is_4x4() -> None:
     for operation in (invert_pose, camera_centers, is_rigid):
         with pytest.raises(ShapeError, match=r"\(\*B, 4, 4\), got \(3, 4\)"):
             operation(torch.zeros(3, 4))
+    pose = torch.eye(4)
+    with pytest.raises(ShapeError, match=r"b_from_world must have .* got \(3, 4\)"):
+        relative_pose(pose[:3], pose)
+    with pytest.raises(ShapeError, match=r"a_from_world must have .* got \(3, 4\)"):
+        relative_pose(pose, pose[:3])
+    with pytest.raises(TypeError, match=r"a_from_world must be a torch\.Tensor, got ndarray"):
+        relative_pose(pose, pose.numpy())
+    with pytest.raises(ShapeError, match=r"must broadcast, got \(3,\), \(2,\)"):
+        relative_pose(pose.expand(3, 4, 4), pose.expand(2, 4, 4))
 
 
 @given(pose=poses(3, turn=3.0, shift=100.0))

@@ -1,5 +1,7 @@
 """Sparse depth images: which pixel, and who wins."""
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given
@@ -54,6 +56,62 @@ def test_wrong_arguments_are_named() -> None:
         rasterize_depth(pixels, depth, image_size=SIZE, reduce="back")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="splat must be"):
         rasterize_depth(pixels, depth, image_size=SIZE, splat="cubic")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["weights", "mask"])
+@pytest.mark.parametrize("shape", [(6, 1), (1,), (5,), (), (2, 6, 1)], ids=str)
+def test_weights_and_mask_are_one_for_each_point(name: str, shape: tuple[int, ...]) -> None:
+    wrong = torch.ones(shape, dtype=torch.bool if name == "mask" else torch.float32)
+    arguments: dict[str, Any] = {name: wrong}
+    with pytest.raises(ShapeError, match=rf"{name} (has N|must have shape \(\*B, N\))"):
+        rasterize_depth(torch.zeros(6, 2), torch.ones(6), image_size=SIZE, **arguments)
+
+
+@pytest.mark.parametrize("name", ["pixels", "depth", "weights", "mask"])
+def test_batch_dims_that_do_not_broadcast_are_named(name: str) -> None:
+    arguments: dict[str, Any] = {
+        "pixels": torch.zeros(2, 6, 2),
+        "depth": torch.ones(2, 6),
+        "weights": torch.ones(2, 6),
+        "mask": torch.ones(2, 6, dtype=torch.bool),
+    }
+    arguments[name] = torch.cat([arguments[name], arguments[name][:1]])
+    with pytest.raises(ShapeError, match="leading batch dims must broadcast"):
+        rasterize_depth(image_size=SIZE, **arguments)
+
+
+def test_a_number_is_no_weights() -> None:
+    with pytest.raises(TypeError, match=r"weights must be a torch\.Tensor, got float"):
+        rasterize_depth(torch.zeros(6, 2), torch.ones(6), image_size=SIZE, weights=2.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_vmap_is_a_batch_dim_and_traced_as_one_graph_it_is_the_same(kind: tuple[str, str]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    pixels = 4 * torch.rand(3, 6, 2, generator=generator)
+    depth = 1 + torch.rand(3, 6, generator=generator)
+    weights = torch.linspace(0.5, 1, 6)
+
+    def image(pixels: Tensor, depth: Tensor) -> Tensor:
+        reduce, splat = kind
+        return rasterize_depth(
+            pixels,
+            depth,
+            image_size=SIZE,
+            weights=weights,
+            mask=depth > 1.1,
+            reduce=reduce,  # type: ignore[arg-type]
+            splat=splat,  # type: ignore[arg-type]
+        ).depth
+
+    wanted = image(pixels, depth)
+    assert wanted.shape == (3, 1, *SIZE) and (wanted > 0).any()
+    assert_close(torch.func.vmap(image)(pixels, depth), wanted)
+    torch.compiler.reset()
+    traced = torch.compile(image, fullgraph=True, backend="aot_eager")
+    assert_close(traced(pixels, depth), wanted)
+    torch.compiler.reset()
 
 
 @pytest.mark.parametrize("kind", KINDS)

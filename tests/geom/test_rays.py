@@ -58,7 +58,7 @@ def noisy(rays: Tensor, noise: Tensor) -> Tensor:
 def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ShapeError, match="rays has V = 3 but cam_from_world has V = 2"):
         triangulate_rays(torch.eye(4).expand(2, 4, 4), torch.zeros(3, 5, 3))
-    with pytest.raises(ShapeError, match="rays has N = 5 but weights has N = 4"):
+    with pytest.raises(ShapeError, match="weights has N = 4 but rays has N = 5"):
         triangulate_rays(torch.eye(4).expand(2, 4, 4), torch.zeros(2, 5, 3), torch.ones(2, 4))
 
 

@@ -18,9 +18,9 @@ def test_wrong_arguments_are_named() -> None:
     proj, pixels, points = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2), torch.zeros(5, 3)
     with pytest.raises(ShapeError, match="points has N = 4 but pixels has N = 5"):
         refine_points(proj, pixels, points[:4])
-    with pytest.raises(ShapeError, match="pixels has N = 5 but weights has N = 4"):
+    with pytest.raises(ShapeError, match="weights has N = 4 but pixels has N = 5"):
         refine_points(proj, pixels, points, torch.ones(2, 4))
-    with pytest.raises(ShapeError, match="pixels has V = 2 but mask has V = 1"):
+    with pytest.raises(ShapeError, match="mask has V = 1 but pixels has V = 2"):
         refine_points(proj, pixels, points, mask=torch.ones(1, 5, dtype=torch.bool))
     with pytest.raises(ValueError, match="or 'cauchy', got 'l1'"):
         refine_points(proj, pixels, points, loss="l1")  # type: ignore[arg-type]

@@ -168,18 +168,20 @@ def test_a_view_that_is_not_finite_is_an_outlier(
 
 def test_what_fails_says_why() -> None:
     scene = ring()
-    pixels = scene.pixels.repeat(1, 6, 1)
-    mask = torch.ones(4, 6, dtype=torch.bool)
+    pixels = scene.pixels.repeat(1, 7, 1)
+    mask = torch.ones(4, 7, dtype=torch.bool)
     pixels[1:, 1:4] += torch.tensor([[0, 90], [0, -90], [50, 200]])[:, None]  # px: none agree
     mask[1:, 2] = False  # a view alone
-    pixels[1, 3] = torch.nan
+    pixels[1, 3] = torch.nan  # the others do not agree either
     mask[2:, 4] = False
     pixels[1, 4, 1] += 60  # two that disagree
     mask[3, 5] = False
     pixels[0, 5] = torch.inf
+    pixels[0, 6] = torch.nan
+    mask[2:, 6] = False  # without it there is one view
     result = triangulate_robust(scene.views.proj, pixels, mask=mask)
     few, unknown = Status.TOO_FEW_VIEWS, Status.NOT_FINITE_INPUT
-    assert result.status.tolist() == [Status.OK, few, few, unknown, few, Status.OK]
+    assert result.status.tolist() == [Status.OK, few, few, few, few, Status.OK, unknown]
     assert torch.equal(result.valid, result.status == Status.OK)
     assert torch.equal(result.inliers.any(dim=0), result.valid)
     for value in (result.points.mT, result.depth, result.residual, result.parallax):

@@ -53,6 +53,12 @@ def test_wrong_arguments_are_named() -> None:
         triangulate_tracks(proj, pixels, index, index, 1, torch.ones(1))
     with pytest.raises(ShapeError, match=r"proj must have shape \(C, 3, 4\), got \(1, 2, 3, 4\)"):
         triangulate_tracks(proj[None], pixels, index, index, 1)
+    with pytest.raises(ShapeError, match=r"camera_index must have shape \(T\), got \(1, 5\)"):
+        triangulate_tracks(proj, pixels, index[None], index, 1)
+    with pytest.raises(ShapeError, match=r"weights must have shape \(T\), got \(1, 5\)"):
+        triangulate_tracks(proj, pixels, index, index, 1, torch.ones(1, 5))
+    with pytest.raises(TypeError, match=r"proj must be floating point, got torch\.int64"):
+        triangulate_tracks(proj.long(), pixels, index, index, 1)
     with pytest.raises(ValueError, match="num_points must not be negative, got -1"):
         triangulate_tracks(proj, pixels, index, index, -1)
     for cameras, points in ((index + 2, index), (index, index + 1), (index - 1, index)):

@@ -1,5 +1,8 @@
 """Weighted, masked n-view triangulation: its invariants, and its answer against other solvers."""
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import pytest
 import torch
@@ -21,6 +24,7 @@ from deltas_geom import (
     reprojection_residual,
     triangulate,
     triangulate_points,
+    triangulate_robust,
 )
 from deltas_geom.testing import (
     PosedScene,
@@ -28,6 +32,7 @@ from deltas_geom.testing import (
     forward_motion,
     right_angle,
     rigid,
+    ring,
     scene_from,
 )
 from deltas_geom.testing.strategies import posed_scenes, scales, vectors
@@ -37,12 +42,25 @@ def test_wrong_arguments_are_named() -> None:
     proj, pixels = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2)
     with pytest.raises(ShapeError, match="pixels has V = 3 but proj has V = 2"):
         triangulate(proj, torch.zeros(3, 5, 2))
-    with pytest.raises(ShapeError, match="pixels has N = 5 but weights has N = 4"):
+    with pytest.raises(ShapeError, match="weights has N = 4 but pixels has N = 5"):
         triangulate(proj, pixels, torch.ones(2, 4))
-    with pytest.raises(ShapeError, match="pixels has V = 2 but mask has V = 1"):
+    with pytest.raises(ShapeError, match="mask has V = 1 but pixels has V = 2"):
         triangulate(proj, pixels, mask=torch.ones(1, 5, dtype=torch.bool))
     with pytest.raises(ValueError, match="frame must be 'rig' or 'world', got 'rigid'"):
         triangulate(proj, pixels, frame="rigid")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("operation", [triangulate, triangulate_points, triangulate_robust])
+def test_arguments_of_another_kind_are_named(operation: Callable[..., Any]) -> None:
+    proj, pixels, weights = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2), torch.ones(2, 5)
+    with pytest.raises(TypeError, match=r"weights must be a torch\.Tensor"):
+        operation(proj, pixels, weights.numpy())
+    with pytest.raises(TypeError, match=r"mask must be a torch\.Tensor"):
+        operation(proj, pixels, mask=weights.bool().numpy())
+    with pytest.raises(TypeError, match=r"proj must be floating point, got torch\.int64"):
+        operation(proj.long(), pixels)
+    with pytest.raises(ShapeError, match="leading batch dims must broadcast"):
+        operation(proj.expand(3, -1, -1, -1), pixels.expand(2, -1, -1, -1))
 
 
 def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
@@ -284,3 +302,12 @@ def test_no_weights_are_equal_weights(drawn: tuple[PosedScene, Tensor]) -> None:
     alone = triangulate_points(scene.views.proj, scene.pixels)
     found = triangulate_points(scene.views.proj, scene.pixels, torch.full_like(weights, 0.3))
     assert_close(found, alone, rtol=0, atol=1e-9)
+
+
+def test_a_covariance_beyond_the_dtype_is_a_covariance_still() -> None:
+    scene = ring(dtype=torch.float32)
+    faint = torch.full(scene.pixels.shape[:-1], 5e-24)
+    found = triangulate(scene.views.proj, scene.pixels, faint, covariance=True)
+    limit = torch.finfo(torch.float32).max
+    assert found.valid.all() and found.covariance is not None
+    assert torch.equal(found.covariance, (limit * torch.eye(3)).expand_as(found.covariance))

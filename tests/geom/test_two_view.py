@@ -73,7 +73,7 @@ def test_wrong_arguments_are_named() -> None:
         triangulate_two_view(proj, torch.zeros(3, 5, 2))
     with pytest.raises(ShapeError, match=r"proj must have shape \(\*B, 2, 3, 4\), got \(3, 3"):
         triangulate_two_view(torch.zeros(3, 3, 4), pixels)
-    with pytest.raises(ShapeError, match="pixels has N = 5 but mask has N = 4"):
+    with pytest.raises(ShapeError, match="mask has N = 4 but pixels has N = 5"):
         triangulate_two_view(proj, pixels, torch.ones(2, 4, dtype=torch.bool))
 
 

@@ -1,6 +1,8 @@
 """Residual, parallax and covariance of given points."""
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -72,6 +74,16 @@ def moved(views: PosedViews, change: Tensor) -> PosedViews:
     return PosedViews(views.K.expand(*change.shape[:-1], 3, 3), moved_pose)
 
 
+def is_covariance(found: Tensor) -> bool:
+    """Are matrices finite, symmetric and positive semidefinite within rounding?"""
+    eps = torch.finfo(found.dtype).eps
+    size = found.abs().amax(dim=(-2, -1), keepdim=True)
+    # What has lost digits below the smallest normal number is as good as 0.
+    unit = torch.where(size > torch.finfo(found.dtype).tiny / eps, found / size, 0.0).double()
+    least = torch.linalg.eigvalsh(unit).amin() if found.isfinite().all() else -torch.inf
+    return bool(least >= -32 * eps) and bool(((unit - unit.mT).abs() <= 32 * eps).all())
+
+
 def test_wrong_shapes_are_named() -> None:
     scene = forward_motion()
     proj, points = scene.views.proj, scene.points
@@ -88,6 +100,48 @@ def test_wrong_shapes_are_named() -> None:
         ray_parallax(proj, points, torch.ones(2, 4, dtype=torch.bool))
     with pytest.raises(ShapeError, match="pixels"):
         reprojection_residual(proj, points, torch.zeros(3, 3, 2).double(), weights)
+
+
+def test_a_mask_is_bool_and_of_the_weights_shape() -> None:
+    scene = forward_motion()
+    proj, points, pixels = scene.views.proj, scene.points, scene.pixels
+    weights = torch.ones(2, 3).double()
+    for function in (point_covariance, partial(reprojection_residual, pixels=pixels)):
+        with pytest.raises(ShapeError, match="mask has N = 2"):
+            function(proj, points, weights=weights, mask=weights[:, :2] > 0)
+        with pytest.raises(TypeError, match="mask must be bool"):
+            function(proj, points, weights=weights, mask=weights)
+    with pytest.raises(TypeError, match="proj must be floating point"):
+        point_covariance(proj.long(), points, weights)
+
+
+ARGUMENTS = {
+    point_covariance: ("proj", "points", "weights", "mask", "pose_covariance"),
+    reprojection_residual: ("proj", "points", "pixels", "weights", "mask"),
+    ray_parallax: ("proj", "points", "used"),
+    depth_variance: ("proj", "covariance"),
+}
+
+
+@pytest.mark.parametrize("function", ARGUMENTS)
+def test_batch_dims_that_do_not_broadcast_are_named(function: Callable[..., Tensor]) -> None:
+    used = torch.ones(2, 2, 3, dtype=torch.bool)
+    batches_of_two = {
+        "proj": torch.eye(3, 4).expand(2, 2, 3, 4),
+        "points": torch.ones(2, 3, 3),
+        "pixels": torch.ones(2, 2, 3, 2),
+        "weights": torch.ones(2, 2, 3),
+        "mask": used,
+        "used": used,
+        "covariance": torch.eye(3).expand(2, 3, 3, 3),
+        "pose_covariance": torch.eye(6).expand(2, 2, 6, 6),
+    }
+    arguments = {name: batches_of_two[name] for name in ARGUMENTS[function]}
+    assert function(**arguments).shape[0] == 2
+    for name, two in arguments.items():
+        three = torch.cat([two, two[:1]])
+        with pytest.raises(ShapeError, match="leading batch dims must broadcast"):
+            function(**(arguments | {name: three}))
 
 
 def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
@@ -194,6 +248,138 @@ def test_an_unused_view_tells_nothing(drawn: tuple[PosedScene, Tensor], view: in
     assert_close(found, wanted, rtol=0, atol=1e-12 * size)
 
 
+WRONG = (torch.nan, torch.inf, -torch.inf, 1e200)
+
+
+@given(
+    drawn=weighted(),
+    view=st.integers(0, 2),
+    wrong=st.sampled_from(WRONG),
+    by_mask=st.booleans(),
+)
+def test_an_unused_view_may_hold_anything(
+    drawn: tuple[PosedScene, Tensor], view: int, wrong: float, by_mask: bool
+) -> None:
+    scene, weights = drawn
+    rest = [other for other in range(3) if other != view]
+    proj, pixels, noise = scene.views.proj.clone(), scene.pixels.clone(), pose_noise(3)
+    proj[view], pixels[view], noise[view] = wrong, wrong, wrong
+    mask = (torch.arange(3) != view)[:, None].expand(3, 4)
+    spoilt = weights.clone()
+    spoilt[view] = wrong if by_mask else 0
+    inputs = [t.requires_grad_() for t in (proj, scene.points.clone(), pixels, spoilt, noise)]
+    proj, points, pixels, spoilt, noise = inputs
+    given_mask = mask if by_mask else None
+    found = (
+        point_covariance(proj, points, spoilt, mask=given_mask),
+        point_covariance(proj, points, spoilt, mask=given_mask, pose_covariance=noise),
+        reprojection_residual(proj, points, pixels, spoilt, mask=given_mask),
+        ray_parallax(proj, points, mask),
+    )
+    sound = scene.views.proj[rest], scene.points
+    wanted = (
+        point_covariance(*sound, weights[rest]),
+        point_covariance(*sound, weights[rest], pose_covariance=pose_noise(3)[rest]),
+        reprojection_residual(*sound, scene.pixels[rest], weights[rest]),
+        ray_parallax(*sound, mask[rest]),
+    )
+    for ours, theirs in zip(found, wanted, strict=True):
+        assert_close(ours, theirs, rtol=0, atol=1e-12 * max(1.0, float(theirs.abs().max())))
+    total = sum(value.sum() for value in found[:3])
+    assert isinstance(total, Tensor)
+    for gradient, tensor in zip(torch.autograd.grad(total, inputs), inputs, strict=True):
+        assert gradient.isfinite().all()
+        if tensor is not points:
+            assert (gradient[view] == 0).all()
+
+
+FAILING = {
+    "camera": {"covariance", "with poses", "residual", "parallax"},
+    "point": {"covariance", "with poses", "residual", "parallax"},
+    "weight": {"covariance", "with poses", "residual"},
+    "pixel": {"residual"},
+    "pose": {"with poses"},
+}
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("what", FAILING)
+def test_of_a_point_with_something_used_that_is_not_finite_nothing_is_stated(
+    what: str, wrong: float
+) -> None:
+    scene = three_views()
+    proj, points, pixels = scene.views.proj.clone(), scene.points.clone(), scene.pixels + 1
+    weights, noise = torch.ones(3, 2).double(), pose_noise(3)
+    weights[1, 1] = 0  # the second point does without what is spoilt
+    entry = {
+        "camera": proj[1, 0, 2:3],
+        "point": points[0, 1:2],
+        "weight": weights[1, :1],
+        "pixel": pixels[1, 0, :1],
+        "pose": noise[1, 3, 4:5],
+    }
+    entry[what].fill_(wrong)
+    inputs = [t.requires_grad_() for t in (proj, points, pixels, weights, noise)]
+    found = {
+        "covariance": point_covariance(proj, points, weights),
+        "with poses": point_covariance(proj, points, weights, pose_covariance=noise),
+        "residual": reprojection_residual(proj, points, pixels, weights),
+        "parallax": ray_parallax(proj, points, weights != 0),
+    }
+    for name, value in found.items():
+        assert value.isfinite().all(), name
+        assert (value[0] == 0).all() == (name in FAILING[what]), name
+        assert (value[1] != 0).all(), name
+    for name in ("covariance", "with poses", "residual"):
+        for gradient in torch.autograd.grad(found[name].sum(), inputs, allow_unused=True):
+            assert gradient is None or gradient.isfinite().all(), name
+
+
+def test_depths_in_a_camera_that_is_not_finite_are_0_and_in_others_as_before() -> None:
+    scene = three_views()
+    noise = point_covariance(scene.views.proj, scene.points, torch.ones(3, 2).double())
+    wanted = depth_variance(scene.views.proj, noise)
+    proj, spread = scene.views.proj.clone(), noise.clone()
+    proj[1, 2, 1], spread[0, 1, 2] = torch.nan, torch.inf
+    inputs = proj.requires_grad_(), spread.requires_grad_()
+    found = depth_variance(*inputs)
+    assert (found[1] == 0).all() and (found[:, 0] == 0).all()
+    assert_close(found[[0, 2], 1], wanted[[0, 2], 1])
+    for gradient in torch.autograd.grad(found.sum(), inputs):
+        assert gradient.isfinite().all() and (gradient != 0).any()
+
+
+@given(drawn=weighted(), keep=st.lists(st.booleans(), min_size=12, max_size=12))
+def test_a_mask_is_a_weight_of_0(drawn: tuple[PosedScene, Tensor], keep: list[bool]) -> None:
+    scene, weights = drawn
+    mask = torch.tensor(keep).view(3, 4)
+    proj, points, pixels = scene.views.proj, scene.points, scene.pixels + 1
+    for options in ({}, {"pose_covariance": pose_noise(3)}):
+        found = point_covariance(proj, points, weights, mask=mask, **options)
+        assert torch.equal(found, point_covariance(proj, points, weights * mask, **options))
+    seen = reprojection_residual(proj, points, pixels, weights, mask=mask)
+    assert torch.equal(seen, reprojection_residual(proj, points, pixels, weights * mask))
+
+
+def test_points_that_failed_state_nothing_if_they_are_left_out() -> None:
+    scene = three_views()
+    pose = scene.views.cam_from_world.clone()
+    pose[:, 2, 3] += 2  # the origin, where failed points lie, is ahead
+    scene = scene_from(PosedViews(scene.views.K, pose), scene.points)
+    pixels, weights = scene.pixels.clone(), torch.ones(3, 2).double()
+    pixels[1, 0] = torch.nan
+    result = triangulate(scene.views.proj, pixels, weights, covariance=True)
+    assert result.valid.tolist() == [False, True]
+    proj, points = scene.views.proj, result.points
+    assert (point_covariance(proj, points, weights)[0] != 0).all()  # that of the origin
+    for found in (
+        point_covariance(proj, points, weights * result.valid),
+        point_covariance(proj, points, weights, mask=(weights > 0) & result.valid),
+    ):
+        assert_close(found, result.covariance, rtol=1e-9, atol=0)
+        assert (found[0] == 0).all()
+
+
 @given(drawn=weighted())
 def test_it_is_the_covariance_of_triangulated_points(drawn: tuple[PosedScene, Tensor]) -> None:
     scene, weights = drawn
@@ -279,8 +465,8 @@ def test_no_finite_input_gives_nan_or_inf(
             (value.sign() * value.abs() ** power).to(dtype) for value in (cameras, points, weights)
         ]
         noise = pose_noise(3).to(dtype)
-        assert point_covariance(*inputs).isfinite().all()
-        assert point_covariance(*inputs, pose_covariance=noise).isfinite().all()
+        assert is_covariance(point_covariance(*inputs))
+        assert is_covariance(point_covariance(*inputs, pose_covariance=noise))
         angle = ray_parallax(inputs[0], inputs[1], inputs[2] != 0)
         assert angle.isfinite().all() and (angle >= 0).all() and (angle <= math.pi).all()
         seen = reprojection_residual(
@@ -362,6 +548,64 @@ def test_fewer_than_two_views_state_nothing_and_one_line_states_a_large_variance
     assert (depth > 1e6).all()  # m^2
     behind = torch.tensor([[0.0, 0.0, -3.0]]).double()
     assert (point_covariance(proj, behind, torch.ones(3, 1).double()) == 0).all()
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.float32, torch.float64], ids=str)
+def test_what_is_too_large_for_the_dtype_is_a_multiple_of_the_identity(kind: torch.dtype) -> None:
+    scene, largest = three_views(), torch.finfo(kind).max
+    proj, points = (tensor.to(kind) for tensor in (scene.views.proj, scene.points))
+    weights = torch.tensor([largest**-0.9, 1.0], dtype=kind).expand(3, 2).contiguous()
+    inputs = [tensor.requires_grad_() for tensor in (proj, points, weights)]
+    for noise in (None, pose_noise(3).to(kind)):
+        found = point_covariance(*inputs, pose_covariance=noise)
+        assert torch.equal(found[0], largest * torch.eye(3, dtype=kind))
+        assert is_covariance(found) and (found[1].abs() < 1).all()
+        depth = depth_variance(proj, found)
+        assert depth.dtype == kind and depth.isfinite().all() and (depth[:, 0] > largest / 2).all()
+        for gradient in torch.autograd.grad(found.sum(), inputs):
+            assert gradient.isfinite().all() and (gradient != 0).any()
+
+
+def test_views_that_tell_nothing_of_a_point_state_the_largest_variance() -> None:
+    # The same pixel wherever a point is: no direction is known, and 1 m^2 would be a claim.
+    proj = torch.tensor([[0.0, 0, 0, 3], [0, 0, 0, 2], [0, 0, 0, 1]]).double().expand(2, 3, 4)
+    found = point_covariance(proj, torch.ones(1, 3).double(), torch.ones(2, 1).double())
+    assert torch.equal(found[0], torch.finfo(torch.float64).max * torch.eye(3).double())
+    # As far away as to be below the range of numbers.
+    far = torch.tensor([[0.0, 0.0, 1e70]], dtype=torch.float64)
+    views = three_views().views.proj
+    found = point_covariance(views, far, torch.ones(3, 1).double())
+    assert is_covariance(found) and (found[0].diagonal() > 1e100).all()
+
+
+def test_weights_whose_squares_no_number_holds_are_weights() -> None:
+    scene, ones = three_views(), torch.ones(3, 2).double()
+    zoom = torch.tensor([1e10, 1e10, 1.0]).double().diag()
+    near = point_covariance(zoom @ scene.views.proj, scene.points, ones)
+    found = point_covariance(zoom @ scene.views.proj, scene.points, 1e-160 * ones)
+    assert_close(found * 1e-300, near * 1e20)
+    pixels = scene.pixels + 1
+    for size in (1e-200, 1e200):
+        residual = reprojection_residual(scene.views.proj, scene.points, pixels, size * ones)
+        assert_close(residual, 2**0.5 * ones[0])  # px
+
+
+@pytest.mark.slow
+def test_vmap_is_a_batch_dim_and_traced_as_one_graph_it_is_the_same() -> None:
+    scene, noise = three_views(), pose_noise(3)
+    weights = torch.tensor([[2.0, 1, 0], [3, 1, 1]]).double()[..., None].expand(2, 3, 2)
+
+    def of_depth(proj: Tensor, points: Tensor, weights: Tensor) -> Tensor:
+        found = point_covariance(proj, points, weights, mask=weights < 2.5, pose_covariance=noise)
+        return depth_variance(proj, found)
+
+    wanted = of_depth(scene.views.proj, scene.points, weights)
+    mapped = torch.func.vmap(of_depth, in_dims=(None, None, 0))
+    assert_close(mapped(scene.views.proj, scene.points, weights), wanted)
+    torch.compiler.reset()
+    traced = torch.compile(of_depth, fullgraph=True, backend="aot_eager")
+    assert_close(traced(scene.views.proj, scene.points, weights), wanted)
+    torch.compiler.reset()
 
 
 def test_they_are_differentiable() -> None:

@@ -1,8 +1,15 @@
 """Posed views and the conversions users need most."""
 
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews, ShapeError, invert_pose, project
@@ -14,6 +21,55 @@ def test_views_need_one_pose_for_each_camera() -> None:
     K = default_intrinsics().expand(2, 3, 3)
     with pytest.raises(ShapeError, match="cam_from_world has V = 3 but K has V = 2"):
         _ = PosedViews(K, torch.eye(4).expand(3, 4, 4)).proj
+
+
+LOOKS: dict[str, Callable[[PosedViews], Any]] = {
+    "proj": lambda views: views.proj,
+    "num_views": lambda views: views.num_views,
+    "select": lambda views: views.select(0),
+    "check_values": lambda views: views.check_values(),
+    "check_shapes": lambda views: views.check_shapes(),
+    "to_kornia": lambda views: views.to_kornia(image_size=(480, 640)),
+    "from_opengl": lambda views: PosedViews.from_opengl(*views),
+    "from_world_from_cam": lambda views: PosedViews.from_world_from_cam(*views),
+}
+
+
+@pytest.mark.parametrize("name", LOOKS)
+@pytest.mark.parametrize(
+    ("K", "poses"),
+    [((), (5,)), ((1,), (5,)), ((), (2, 5)), ((2, 1), (2, 5)), ((2,), (2, 5))],
+    ids=["3 3", "1 3 3", "3 3 of a batch", "2 1 3 3", "one of each scene"],
+)
+def test_one_K_for_all_views_is_an_error_that_mends_itself(
+    name: str, K: tuple[int, ...], poses: tuple[int, ...]
+) -> None:
+    one = default_intrinsics().expand(*K, 3, 3)
+    cam_from_world = torch.eye(4).double().expand(*poses, 4, 4)
+    with pytest.raises(ShapeError, match="for one K of all views pass K") as error:
+        LOOKS[name](PosedViews(one, cam_from_world))
+    assert str(error.value).startswith("K must have shape (*B, 5, 3, 3)")
+    mended = eval(str(error.value).split(" pass ")[1], {"K": one})
+    LOOKS[name](PosedViews(mended, cam_from_world))
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_views_that_do_not_go_together_are_named(name: str) -> None:
+    K, poses = default_intrinsics().expand(5, 3, 3), torch.eye(4).expand(5, 4, 4)
+    pose = "world_from_cam" if name.startswith("from") else "cam_from_world"
+    for views, reason in (
+        (PosedViews(K[:2], poses), f"{pose} has V = 5 but K has V = 2"),
+        (PosedViews(K, poses[0]), rf"{pose} must have shape \(\*B, V, 4, 4\), got \(4, 4\)"),
+        (PosedViews(K, poses[:, :3]), rf"{pose} must have shape .* got \(5, 3, 4\)"),
+        (PosedViews(poses, poses), r"K must have shape \(\*B, V, 3, 3\), got \(5, 4, 4\)"),
+        (PosedViews(K.expand(3, 5, 3, 3), poses.expand(2, 5, 4, 4)), r"broadcast, .*3.*2"),
+    ):
+        with pytest.raises(ShapeError, match=reason):
+            LOOKS[name](views)
+    with pytest.raises(TypeError, match=rf"{pose} must be a torch\.Tensor, got ndarray"):
+        LOOKS[name](PosedViews(K, poses.numpy()))
+    with pytest.raises(TypeError, match=r"K must be a torch\.Tensor, got ndarray"):
+        LOOKS[name](PosedViews(K.numpy(), poses))
 
 
 @given(scene=posed_scenes())
@@ -39,6 +95,31 @@ def test_selected_views_see_what_they_saw(scene: PosedScene) -> None:
         assert_close(pixels, scene.pixels[index], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("index", [np.int64(1), torch.tensor(1), np.array(1), -3], ids=repr)
+def test_an_integer_of_any_kind_keeps_the_view_dim(index: Any) -> None:
+    views = ring().views
+    found = views.select(index)
+    assert found.num_views == 1 and (found.proj[0] == views.proj[1]).all()
+
+
+@pytest.mark.parametrize("index", [np.array([1]), torch.tensor([1]), (1,)], ids=repr)
+def test_a_list_of_one_keeps_the_view_dim(index: Any) -> None:
+    assert ring().views.select(index).proj.shape == (1, 3, 4)
+
+
+def test_a_cast_takes_what_a_tensors_cast_takes() -> None:
+    views = ring().views
+    for cast in (
+        views.to(dtype=torch.float32),
+        views.to("cpu", dtype=torch.float32, copy=True),
+        views.to("cpu", torch.float32, non_blocking=True),
+        views.to(torch.zeros(1)),
+    ):
+        assert isinstance(cast, PosedViews)
+        assert cast.K.dtype == cast.cam_from_world.dtype == torch.float32
+    assert views.to("meta").proj.device.type == "meta"
+
+
 def test_a_cast_casts_both(dtype: torch.dtype) -> None:
     views = ring().views.to(dtype)
     assert views.K.dtype == views.cam_from_world.dtype == dtype and views.num_views == 4
@@ -59,6 +140,18 @@ def test_good_values_pass_and_bad_ones_say_why() -> None:
         PosedViews(views.K, 2 * views.cam_from_world).check_values()
 
 
+def test_a_scale_in_camera_to_world_rotations_is_found_and_is_one_of_depths() -> None:
+    scene = ring()
+    world_from_cam = invert_pose(scene.views.cam_from_world)
+    world_from_cam[..., :3, :3] *= 1.3
+    views = PosedViews.from_world_from_cam(scene.views.K, world_from_cam)
+    wrong, right = (project(v, scene.points).depth for v in (views, scene.views))
+    assert_close(wrong, 1.3 * right)
+    for read in (PosedViews.from_world_from_cam, PosedViews.from_opengl):
+        with pytest.raises(ValueError, match="rigid"):
+            read(scene.views.K, world_from_cam).check_values()
+
+
 @given(scene=posed_scenes(num_views=3))
 def test_kornia_gets_and_gives_back_the_same_cameras(scene: PosedScene) -> None:
     camera = scene.views.to_kornia(image_size=(480, 640))
@@ -74,3 +167,42 @@ def test_a_kornia_batch_is_split_into_views() -> None:
     assert PosedViews.from_kornia(camera, num_views=4).proj.shape == (3, 4, 3, 4)
     with pytest.raises(ShapeError, match="12 kornia cameras are no multiple of num_views=5"):
         PosedViews.from_kornia(camera, num_views=5)
+    with pytest.raises(ShapeError, match="got a kornia camera of none"):
+        PosedViews.from_kornia(_without_cameras())
+    assert PosedViews.from_kornia(_without_cameras(), num_views=2).proj.shape == (0, 2, 3, 4)
+
+
+def _without_cameras() -> PinholeCamera:
+    return PinholeCamera(*(torch.zeros(0, 4, 4),) * 2, *(torch.zeros(0),) * 2)
+
+
+@pytest.mark.parametrize("num_views", [0, -2, -5])
+def test_a_kornia_batch_is_not_split_into_less_than_a_view(num_views: int) -> None:
+    camera = ring().views.to_kornia(image_size=(480, 640))
+    with pytest.raises(
+        ValueError,
+        match=re.escape(f"num_views must be at least 1, or None for all, got {num_views}"),
+    ):
+        PosedViews.from_kornia(camera, num_views=num_views)
+
+
+def in_kornia(views: PosedViews) -> Tensor:
+    camera = views.to_kornia(image_size=(480, 640))
+    back: Tensor = PosedViews.from_kornia(camera).proj
+    return back
+
+
+def test_kornia_gets_what_broadcasts_and_promotes() -> None:
+    views = ring().views
+    moved = views.cam_from_world.repeat(3, 1, 1, 1)
+    moved[1, :, 0, 3] += 1.0
+    batch = PosedViews(views.K, moved)
+    assert_close(in_kornia(batch), batch.proj.flatten(0, 1), rtol=0, atol=0)
+    batch = PosedViews(views.K.expand(3, 4, 3, 3), views.cam_from_world)
+    assert_close(in_kornia(batch), batch.proj.flatten(0, 1), rtol=0, atol=0)
+    for mixed in (
+        PosedViews(views.K, views.cam_from_world.float()),
+        PosedViews(views.K.float(), views.cam_from_world),
+    ):
+        assert mixed.proj.dtype == torch.float64
+        assert_close(in_kornia(mixed), mixed.proj, rtol=0, atol=0)

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom import PosedViews, Status, project, triangulate
+from deltas_geom import (
+    PosedViews,
+    ShapeError,
+    Status,
+    project,
+    triangulate,
+    triangulate_robust,
+)
 from deltas_geom.testing import PosedScene
 from deltas_geom.testing.strategies import posed_scenes
 
@@ -79,6 +86,43 @@ def test_any_batch_dims_and_no_covariance() -> None:
     found = triangulate(views.proj, batched).within_depth((0.5, 20.0))
     assert found.covariance is None
     assert_close(found.valid, torch.tensor([True, False]).expand(2, 3, 2))
+
+
+def test_what_a_view_did_not_see_need_not_be_in_its_range() -> None:
+    # The third camera looks the other way.
+    views, pixels = stereo(torch.tensor([2.0, 9.0]))
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    proj = torch.cat([PosedViews(views.K[:1], away[None]).proj, views.proj])
+    pixels = torch.cat([torch.full((1, 2, 2), torch.nan), pixels])
+    used = torch.tensor([False, True, True])[:, None].expand(3, 2)
+    found = triangulate(proj, pixels, mask=used)
+    assert found.valid.all()
+    assert not found.within_depth((0.5, 5.0)).valid.any()
+    within = found.within_depth((0.5, 5.0), used=used)
+    assert within.valid.tolist() == [True, False]
+    assert torch.equal(within.points[0], found.points[0])
+    robust = triangulate_robust(proj, pixels).within_depth((0.5, 5.0))
+    assert robust.valid.tolist() == [True, False]
+    assert robust.inliers.tolist() == [[False, False], [True, False], [True, False]]
+    assert (robust.points[1] == 0).all() and robust.covariance is None
+
+
+def test_of_used_views_all_must_have_the_point_in_range() -> None:
+    # Cameras one behind the other: 2 m from one is 3 m from the other.
+    views, _ = stereo(torch.tensor([2.0]))
+    pose = views.cam_from_world.clone()
+    pose[1, :3, 3] = torch.tensor([-0.2, 0.0, 1.0])
+    views = views._replace(cam_from_world=pose)
+    pixels = project(views, torch.tensor([[0.1, 0.0, 2.0]])).pixels
+    found = triangulate(views.proj, pixels)
+    both = torch.ones(2, 1, dtype=torch.bool)
+    assert found.within_depth((1.5, 2.5)).valid.all()
+    assert not found.within_depth((1.5, 2.5), used=both).valid.any()
+    assert found.within_depth((1.5, 3.5), used=both).valid.all()
+    with pytest.raises(ShapeError, match="used has V = 1 but depth has V = 2"):
+        found.within_depth((1.5, 3.5), used=both[:1])
+    with pytest.raises(TypeError, match="used must be bool"):
+        found.within_depth((1.5, 3.5), used=both.float())
 
 
 @pytest.mark.parametrize("depth_range", [(0.0, 1.0), (2.0, 1.0), (-1.0, 1.0), (1.0, math.nan)])

@@ -86,6 +86,40 @@ def test_without_views_there_is_an_error_in_words(name: str) -> None:
         WITHOUT_VIEWS[name]()
 
 
+ONE_K = torch.tensor([[[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]])
+OF_VIEWS: dict[str, Callable[[geom.PosedViews, tuple[int, ...]], Any]] = {
+    "epipolar_segments": lambda views, batch: geom.epipolar_segments(
+        views, torch.zeros(*batch, 6, 2), depth_range=RANGE, image_size=SIZE
+    ),
+    "fundamental_between": lambda views, _: geom.fundamental_between(views),
+    "project": lambda views, batch: geom.project(views, torch.zeros(*batch, 6, 3)),
+    "sample_inv_depths": lambda views, batch: geom.sample_inv_depths(
+        views, torch.zeros(*batch, 6, 2), torch.ones(4), image_size=SIZE
+    ),
+    "unproject": lambda views, batch: geom.unproject(
+        views, torch.zeros(*batch, 5, 6, 2), torch.ones(*batch, 5, 6)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OF_VIEWS)
+def test_cameras_that_do_not_go_together_are_an_error_in_words(name: str) -> None:
+    poses, K = torch.eye(4).repeat(5, 1, 1), ONE_K.repeat(5, 1, 1)
+    operation = OF_VIEWS[name]
+    for one in (ONE_K, ONE_K[0]):
+        with pytest.raises(geom.ShapeError, match=r"one K of all views pass K.expand\(5, 3, 3\)"):
+            operation(geom.PosedViews(one, poses), ())
+    for wrong in (poses[:3], poses[0], poses[:, :3]):
+        with pytest.raises(geom.ShapeError, match="cam_from_world"):
+            operation(geom.PosedViews(K, wrong), ())
+    with pytest.raises(geom.ShapeError, match=r"must broadcast, got \(3,\), \(2,\)"):
+        operation(geom.PosedViews(K.repeat(3, 1, 1, 1), poses.repeat(2, 1, 1, 1)), ())
+    if name != "fundamental_between":
+        with pytest.raises(geom.ShapeError, match=r"must broadcast, got \(3,\), \(2,\)"):
+            operation(geom.PosedViews(K.repeat(3, 1, 1, 1), poses), (2,))
+    operation(geom.PosedViews(K.repeat(3, 1, 1, 1), poses), (2, 1))
+
+
 def test_without_places_or_pixels_of_a_map_there_is_an_error_in_words() -> None:
     with pytest.raises(geom.ShapeError, match="logits must have S >= 1"):
         geom.soft_argmax(torch.zeros(3, 0), torch.zeros(3, 0, 2))

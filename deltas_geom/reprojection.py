@@ -1,0 +1,87 @@
+"""Points as views see them again: projections, distances from pixels, angles between rays."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.homogeneous import safe_divide, safe_sqrt
+from deltas_geom.observations import Vector3
+
+
+class Reprojection(NamedTuple):
+    """Points as views see them.
+
+    Attributes:
+        x: ``(*B, V, N)`` px; 0 where not seen.
+        y: ``(*B, V, N)`` px.
+        inverse: ``(*B, V, N)`` 1 / depth; 0 where not seen.
+        depth: ``(*B, V, N)``.
+        seen: ``(*B, V, N)`` bool, used, in front and not infinitely far to the side.
+    """
+
+    x: Tensor
+    y: Tensor
+    inverse: Tensor
+    depth: Tensor
+    seen: Tensor
+
+
+def reproject(proj: Tensor, points: Vector3, used: Tensor) -> Reprojection:
+    """Project finite points, three ``(*B, N)``, into the used views ``(*B, V, N)``."""
+    x, y, z = (in_views(proj[..., row, :], points) for row in range(3))
+    info = torch.finfo(z.dtype)
+    with torch.no_grad():
+        # Far above the smallest number, so that squares of the inverse are finite.
+        seen = used & (z > info.tiny**0.25)
+        # Projections so far out that products of their squares overflow are beside the camera.
+        seen = seen & (torch.maximum(x.abs(), y.abs()) < info.max**0.2 * z)
+    inverse = safe_divide(torch.ones_like(z), z, seen)
+    return Reprojection(x * inverse, y * inverse, inverse, z, seen)
+
+
+def in_views(row: Tensor, points: Vector3) -> Tensor:
+    """A row ``(*B, V, 4)`` of each camera times points, three ``(*B, N)``: ``(*B, V, N)``."""
+    total = row[..., 3:]
+    for axis, component in enumerate(points):
+        total = torch.addcmul(total, row[..., axis, None], component.unsqueeze(-2))
+    return total
+
+
+def residual_of(found: Reprojection, xy: Tensor, squared: Tensor) -> Tensor:
+    """Weighted RMS distance ``(*B, N)`` px from ``xy``: ``(*B, V, 2, N)``."""
+    x, y = xy.unbind(dim=-2)
+    # Scaled before it is squared: projections may lie anywhere.
+    dx, dy = torch.where(found.seen, found.x - x, 0.0), torch.where(found.seen, found.y - y, 0.0)
+    squared = torch.where(found.seen, squared, 0.0)
+    errors = ((dx * dx + dy * dy) * squared).sum(dim=-2)
+    total = squared.sum(dim=-2)
+    mean = safe_divide(errors, total, total > 0)
+    return safe_sqrt(mean)
+
+
+@torch.no_grad()
+def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
+    """Largest angle ``(*B, N)`` rad between rays from ``(*B, V, 3)`` to the points.
+
+    Args:
+        centers: of the cameras.
+        points: three ``(*B, N)`` in the same frame.
+        used: ``(*B, V, N)`` 1 or 0.
+    """
+    x, y, z = (
+        component.unsqueeze(-2) - center[..., None]
+        for component, center in zip(points, centers.unbind(dim=-1), strict=True)
+    )  # (*B, V, N)
+    tiny = torch.finfo(x.dtype).tiny ** 0.5
+    inverse = torch.rsqrt(torch.addcmul(torch.addcmul(x * x, y, y), z, z).clamp(min=tiny))
+    x, y, z = x * inverse, y * inverse, z * inverse
+    chord = torch.zeros_like(used[..., 0, :])
+    for first in range(used.shape[-2] - 1):
+        one, rest = slice(first, first + 1), slice(first + 1, None)
+        dx, dy, dz = (t[..., one, :] - t[..., rest, :] for t in (x, y, z))
+        apart = torch.addcmul(torch.addcmul(dx * dx, dy, dy), dz, dz)
+        both = used[..., one, :] * used[..., rest, :]
+        chord = torch.maximum(chord, (apart * both).amax(dim=-2))
+    # The chord keeps small angles that the arc cosine of a dot product rounds away.
+    return 2 * torch.asin((0.5 * chord.sqrt()).clamp(max=1))
