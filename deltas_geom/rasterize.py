@@ -5,7 +5,13 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_bool, check_image_size, check_shapes
+from deltas_geom.checks import (
+    batch_shape,
+    check_bool,
+    check_floating,
+    check_image_size,
+    check_shapes,
+)
 from deltas_geom.homogeneous import safe_divide
 from deltas_geom.precision import promoted, without_autocast
 
@@ -52,7 +58,7 @@ def rasterize_depth(
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
-        TypeError: the mask is not bool, or the weights are no tensor.
+        TypeError: the mask is not bool, the weights are no tensor, or all numbers are integers.
         ValueError: unknown reduce or splat, or an image without pixels.
 
     Source: the paper, section 3.3.
@@ -74,6 +80,7 @@ def rasterize_depth(
     check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
     pixels, depth, given = promoted(pixels, depth, given)
+    check_floating(depth=depth)
     used = depth.isfinite() & (depth > 0) & given.isfinite() & (given > 0)
     used = used & pixels.isfinite().all(dim=-1)
     if mask is not None:
