@@ -19,7 +19,7 @@ from deltas_geom.precision import at_least_single, promoted, without_autocast
 from deltas_geom.recompute import recomputed
 from deltas_geom.sampling import Samples
 
-_CACHED_ELEMENTS = 1 << 20  # a chunk should stay in the cache between writing and reading it
+_CACHED_ELEMENTS = 1 << 21  # a chunk should stay in the cache between writing and reading it
 _HELD_ELEMENTS = 1 << 28  # where there is no such cache: what one call may hold in memory
 
 
