@@ -23,8 +23,8 @@ class Prediction:
     device: str = "auto"
     """Where to compute: auto, cpu, cuda, cuda:1, mps."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 is as accurate and faster where the processor multiplies it (AMX, NVIDIA), many
-    times slower where not. Geometry stays in float32."""
+    """bfloat16 is as accurate, and faster where the processor multiplies it (AMX, NVIDIA); others
+    emulate it. Geometry stays in float32."""
     depth_range: tuple[float, float] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
     work_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
