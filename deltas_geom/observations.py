@@ -205,9 +205,8 @@ def weigh_pixels(
 def check_pixels(
     cameras: Cameras, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
 ) -> torch.Size:
-    """:func:`check_weights` of pixels ``(*B, V, N, 2)``."""
-    check_shapes(proj=(cameras.proj, "V 3 4"), pixels=(pixels, "V N 2"))
-    return check_weights(weights, mask, "pixels", pixels, "V N 2", cameras.proj.shape[:-3])
+    """:func:`check_observed` by cameras that are cleaned already."""
+    return check_observed(cameras.proj, pixels, weights, mask)
 
 
 def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,5 +33,5 @@ def load_own(file: Path) -> nn.Module:
     Raises:
         UserError: the file is missing or holds something else.
     """
-    model = load_model(str(file))
+    model = load_model(file)
     return OwnScores(model.encoder, model.detector).eval()
