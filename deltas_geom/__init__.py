@@ -4,21 +4,8 @@ Posed views, epipolar segments, sampling and matching along them, triangulation,
 Conventions: OpenCV axes, ``cam_from_world``, pixel centres at integers, metres.
 """
 
-from deltas_geom.checks import ShapeError
-from deltas_geom.correlation import correlate, correlate_normalized
-from deltas_geom.fundamental import epipolar_distance, epipolar_lines, fundamental_between
-from deltas_geom.homogeneous import from_homogeneous, to_homogeneous
-from deltas_geom.matching import (
-    Matches,
-    SoftArgmax,
-    match_joint,
-    match_per_view,
-    soft_argmax,
-    weights_from_covariance,
-)
-from deltas_geom.midpoint import triangulate_inverse_depth_weighted, triangulate_midpoint
-from deltas_geom.modules import DepthRasterizer, EpipolarSampler, Triangulator
-from deltas_geom.pixels import (
+from deltas_geom.cameras.homogeneous import from_homogeneous, to_homogeneous
+from deltas_geom.cameras.pixels import (
     crop_intrinsics,
     in_image,
     normalize_pixels,
@@ -26,26 +13,42 @@ from deltas_geom.pixels import (
     resize_intrinsics,
     resize_pixels,
 )
-from deltas_geom.poses import camera_centers, invert_pose, is_rigid, relative_pose
-from deltas_geom.projection import Projection, pixel_rays, project, unproject
+from deltas_geom.cameras.poses import camera_centers, invert_pose, is_rigid, relative_pose
+from deltas_geom.cameras.projection import Projection, pixel_rays, project, unproject
+from deltas_geom.cameras.views import PosedViews
+from deltas_geom.checks import ShapeError
+from deltas_geom.epipolar.fundamental import epipolar_distance, epipolar_lines, fundamental_between
+from deltas_geom.epipolar.sampling import Samples, sample_inv_depths, sample_map, sample_segments
+from deltas_geom.epipolar.segments import Segments, epipolar_segments
+from deltas_geom.matching.correlation import correlate, correlate_normalized
+from deltas_geom.matching.matches import (
+    Matches,
+    SoftArgmax,
+    match_joint,
+    match_per_view,
+    soft_argmax,
+    weights_from_covariance,
+)
+from deltas_geom.modules import DepthRasterizer, EpipolarSampler, Triangulator
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
-from deltas_geom.rays import triangulate_rays
-from deltas_geom.refine import Refined, refine_points
-from deltas_geom.robust import triangulate_robust
-from deltas_geom.sampling import Samples, sample_inv_depths, sample_map, sample_segments
-from deltas_geom.segments import Segments, epipolar_segments
 from deltas_geom.status import Status
-from deltas_geom.tracks import TriangulatedTracks, triangulate_tracks
-from deltas_geom.triangulated import RobustTriangulation, Triangulation
-from deltas_geom.triangulation import triangulate, triangulate_points
-from deltas_geom.two_view import TwoViewTriangulation, triangulate_two_view
-from deltas_geom.uncertainty import (
+from deltas_geom.triangulation.midpoint import (
+    triangulate_inverse_depth_weighted,
+    triangulate_midpoint,
+)
+from deltas_geom.triangulation.rays import triangulate_rays
+from deltas_geom.triangulation.refine import Refined, refine_points
+from deltas_geom.triangulation.results import RobustTriangulation, Triangulation
+from deltas_geom.triangulation.robust import triangulate_robust
+from deltas_geom.triangulation.tracks import TriangulatedTracks, triangulate_tracks
+from deltas_geom.triangulation.triangulate import triangulate, triangulate_points
+from deltas_geom.triangulation.two_view import TwoViewTriangulation, triangulate_two_view
+from deltas_geom.triangulation.uncertainty import (
     depth_variance,
     point_covariance,
     ray_parallax,
     reprojection_residual,
 )
-from deltas_geom.views import PosedViews
 
 __all__ = [
     "DepthRasterizer",

@@ -5,12 +5,12 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from deltas_geom.cameras.views import PosedViews
+from deltas_geom.epipolar.sampling import Samples, sample_segments
+from deltas_geom.epipolar.segments import epipolar_segments
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
-from deltas_geom.sampling import Samples, sample_segments
-from deltas_geom.segments import epipolar_segments
-from deltas_geom.triangulated import Triangulation
-from deltas_geom.triangulation import triangulate
-from deltas_geom.views import PosedViews
+from deltas_geom.triangulation.results import Triangulation
+from deltas_geom.triangulation.triangulate import triangulate
 
 
 class EpipolarSampler(nn.Module):

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.checks import (
     batch_shape,
     check_bool,
@@ -12,8 +13,7 @@ from deltas_geom.checks import (
     check_image_size,
     check_shapes,
 )
-from deltas_geom.homogeneous import safe_divide
-from deltas_geom.precision import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
 class SparseDepth(NamedTuple):

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from deltas_geom.pixels import resize_intrinsics
-from deltas_geom.poses import relative_pose
+from deltas_geom.cameras.pixels import resize_intrinsics
+from deltas_geom.cameras.poses import relative_pose
 from deltas_nets.data.capture import Frame
 from deltas_nets.data.sample import SMALLEST_BASELINE
 from deltas_nets.errors import UserError

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from deltas_geom.fundamental import epipolar_lines
-from deltas_geom.homogeneous import to_homogeneous
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.epipolar.fundamental import epipolar_lines
 from deltas_geom.status import Status
 from deltas_geom.testing.scenes import IMAGE_SIZE
 

@@ -5,11 +5,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.pixels import crop_intrinsics, resize_intrinsics
-from deltas_geom.poses import invert_pose
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
+from deltas_geom.cameras.poses import invert_pose
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.testing.scenes import IMAGE_SIZE, rigid
-from deltas_geom.views import PosedViews
 
 
 class World(NamedTuple):

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import check_image_size
 from deltas_geom.testing.arguments import check_bounds, check_counts, check_places
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
@@ -19,7 +20,6 @@ from deltas_geom.testing.scenes import (
     ring,
     scene_from,
 )
-from deltas_geom.views import PosedViews
 
 
 def seeded_scene(

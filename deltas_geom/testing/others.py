@@ -14,9 +14,9 @@ from kornia.geometry.subpix import spatial_soft_argmax2d
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from deltas_geom.pixels import normalize_pixels
+from deltas_geom.cameras.pixels import normalize_pixels
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.testing.target import ImageSize, Target
-from deltas_geom.views import PosedViews
 
 KorniaSolver = Literal["eigh", "svd", "cofactor"]
 KORNIA_SOLVERS: tuple[KorniaSolver, ...] = ("eigh", "svd", "cofactor")

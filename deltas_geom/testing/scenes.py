@@ -11,10 +11,10 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.projection import project
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import check_shapes
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.projection import project
-from deltas_geom.views import PosedViews
 
 IMAGE_SIZE = (480, 640)
 """(height, width) that :func:`default_intrinsics` belong to."""

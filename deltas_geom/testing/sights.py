@@ -5,12 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.pixels import in_image
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.pixels import in_image
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.status import Status
 from deltas_geom.testing.agreement import PIXEL_TOLERANCE, assert_near, is_good
 from deltas_geom.testing.target import DepthRange, ImageSize
-from deltas_geom.views import PosedViews
 
 VISIBLE = (Status.OK, Status.NO_PARALLAX)
 """What a segment's mask calls True."""

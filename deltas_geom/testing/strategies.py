@@ -15,13 +15,13 @@ except ImportError as error:  # pragma: no cover
         "deltas_geom.testing.strategies needs hypothesis: pip install 'deltas-depth[test]'"
     ) from error
 
+from deltas_geom.cameras.projection import unproject
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import check_image_size
-from deltas_geom.projection import unproject
 from deltas_geom.testing.arguments import check_bounds, check_counts, check_places
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene, rigid, scene_from
 from deltas_geom.testing.target import DepthRange
-from deltas_geom.views import PosedViews
 
 _DECADES = 307.0  # beyond, a power of 10 is infinite or loses digits in float64
 _MOST_VIEWS = 20

@@ -105,7 +105,7 @@ class Target:
         ValueError: ``max_views`` is less than 2.
 
     Example:
-        >>> from deltas_geom.triangulation import triangulate_points
+        >>> from deltas_geom.triangulation.triangulate import triangulate_points
         >>> mine = Target("mine", triangulate=triangulate_points, max_views=2, weighted=False)
         >>> mine.offers("weights"), mine.offers("project")
         (False, False)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
-from deltas_geom.poses import relative_pose
+from deltas_geom.cameras.poses import relative_pose
 from deltas_nets.cost.memory import PeakMemory
 from deltas_nets.cost.operations import Flops, OperationCounter
 from deltas_nets.cost.stages import GEOMETRY, followed_stages, parameters_by_stage, stage_names

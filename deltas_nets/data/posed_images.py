@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from deltas_geom.views import PosedViews
+from deltas_geom.cameras.views import PosedViews
 
 
 class PosedImages(NamedTuple):

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from deltas_geom.pixels import resize_intrinsics
-from deltas_geom.views import PosedViews
+from deltas_geom.cameras.pixels import resize_intrinsics
+from deltas_geom.cameras.views import PosedViews
 from deltas_nets.data.capture import FloatArray, Frame
 
 __all__ = [

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from deltas_geom.precision import at_least_single
+from deltas_geom.numerics.arithmetic import at_least_single
 
 VIEWS = (2, 3, 5, 8)
 """Numbers of views, the anchor included, that have a curve of their own."""

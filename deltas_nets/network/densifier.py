@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
-from deltas_geom.precision import at_least_single
+from deltas_geom.numerics.arithmetic import at_least_single
 from deltas_nets.network.calibration import SpreadCalibration
 from deltas_nets.network.convex_upsampling import ConvexUpsampling, convex_upsample
 from deltas_nets.network.encoder import CHANNELS, Features

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from deltas_geom.precision import at_least_single
+from deltas_geom.numerics.arithmetic import at_least_single
 from deltas_nets.network.encoder import CHANNELS, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like
 

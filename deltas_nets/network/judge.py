@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import Matches, PosedViews, Triangulation
-from deltas_geom.homogeneous import safe_divide
+from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_nets.network.context import WIDTH
 from deltas_nets.network.layers import WideLinear
 from deltas_nets.network.matcher import Decision, Posterior

@@ -3,7 +3,7 @@
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from deltas_geom.precision import promoted
+from deltas_geom.numerics.arithmetic import promoted
 from deltas_nets.network.conv_norm import conv_norm
 
 

@@ -19,7 +19,7 @@ from deltas_geom import (
     sample_map,
     soft_argmax,
 )
-from deltas_geom.matching import matches_at
+from deltas_geom.matching.matches import matches_at
 from deltas_nets.config import MatcherConfig
 from deltas_nets.network.context import Context, smooth_scores
 from deltas_nets.network.descriptor import WIDTH, Descriptors

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
-from deltas_geom.precision import at_least_single
+from deltas_geom.numerics.arithmetic import at_least_single
 from deltas_nets.config import DetectorConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.calibration import SpreadCalibration

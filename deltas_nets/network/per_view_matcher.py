@@ -17,8 +17,8 @@ from deltas_geom import (
     sample_map,
     sample_segments,
 )
-from deltas_geom.precision import promoted, without_autocast
-from deltas_geom.recompute import recomputed
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.numerics.evaluation import recomputed
 from deltas_nets.config import MatcherConfig
 from deltas_nets.network.descriptor import Descriptors
 from deltas_nets.network.layers import WideBatchNorm1d

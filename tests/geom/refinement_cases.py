@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from deltas_geom import PosedViews
-from deltas_geom.refine import Loss
 from deltas_geom.testing import PosedScene, default_intrinsics, rigid, scene_from
 from deltas_geom.testing.strategies import posed_scenes, vectors
+from deltas_geom.triangulation.refine import Loss
 
 NOISE = 0.5  # px
 LOSSES: list[Loss] = ["squared", "huber", "cauchy"]

@@ -16,8 +16,8 @@ from torch import Tensor
 
 import deltas_geom
 from deltas_geom import ShapeError, Status, triangulate_points
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.poses import camera_centers
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.testing import (
     DEGENERATE_SCENES,
     PosedScene,

@@ -246,7 +246,7 @@ def test_pieces_of_any_size_make_the_whole(
         return found, *torch.autograd.grad((found * pull).sum(), inputs)
 
     whole = outcome()
-    monkeypatch.setattr("deltas_geom.correlation._CACHED_ELEMENTS", limit)
+    monkeypatch.setattr("deltas_geom.matching.correlation._CACHED_ELEMENTS", limit)
     for piece, expected in zip(outcome(), whole, strict=True):
         assert_close(piece, expected, rtol=0, atol=1e-11)
 

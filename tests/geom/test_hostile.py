@@ -23,8 +23,8 @@ from deltas_geom import (
     triangulate_tracks,
     triangulate_two_view,
 )
-from deltas_geom.observations import NEGLIGIBLE_WEIGHT
 from deltas_geom.testing import default_intrinsics, rigid
+from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT
 
 IMAGE_SIZE = (480, 640)
 NAMES = ("ordinary", "pixels", "weights", "cameras", "equal", "everything", "outliers", "behind")

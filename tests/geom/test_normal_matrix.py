@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.normal_matrix import (
+from deltas_geom.testing.strategies import extreme, scales, vectors
+from deltas_geom.triangulation.dlt import (
     Symmetric3,
     _by_views,
     alike_coefficients,
@@ -16,8 +17,7 @@ from deltas_geom.normal_matrix import (
     normal_matrix,
     solve3,
 )
-from deltas_geom.testing.strategies import extreme, scales, vectors
-from deltas_geom.uncertainty import unpacked3
+from deltas_geom.triangulation.uncertainty import unpacked3
 
 EPS = torch.finfo(torch.float64).eps
 

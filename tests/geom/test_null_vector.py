@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.ldl import (
+from deltas_geom.numerics.ldl import (
     Symmetric4,
     Vector4,
     dot,
@@ -19,8 +19,8 @@ from deltas_geom.ldl import (
     shifted_factors,
     unit,
 )
-from deltas_geom.null_vector import NullVector, null_vector, rayleigh_step
-from deltas_geom.proof import proved_vector
+from deltas_geom.numerics.null_vector import NullVector, null_vector, rayleigh_step
+from deltas_geom.numerics.proof import proved_vector
 from deltas_geom.testing.strategies import vectors
 
 ROWS, COLUMNS = torch.triu_indices(4, 4)

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from torch.utils._pytree import tree_leaves, tree_map
 
 import deltas_geom as geom
-from deltas_geom.precision import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 ALL = OPERATIONS | METHODS
 

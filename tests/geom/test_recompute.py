@@ -6,7 +6,7 @@ from hypothesis import given
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.recompute import WithLagrangian, recomputed
+from deltas_geom.numerics.evaluation import WithLagrangian, recomputed
 from deltas_geom.testing.strategies import vectors
 
 

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews, ShapeError, refine_points, reprojection_residual
-from deltas_geom.refine import Loss
 from deltas_geom.testing import DEGENERATE_SCENES, PosedScene, forward_motion, rigid, ring
 from deltas_geom.testing.strategies import extreme, posed_scenes, scales, vectors
+from deltas_geom.triangulation.refine import Loss
 
 
 def test_wrong_arguments_are_named() -> None:

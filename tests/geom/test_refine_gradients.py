@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import refine_points, triangulate_points
-from deltas_geom.refine import Loss
 from deltas_geom.testing import PosedScene, forward_motion, right_angle, ring
+from deltas_geom.triangulation.refine import Loss
 
 
 @pytest.mark.parametrize("loss", LOSSES)

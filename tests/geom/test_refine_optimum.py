@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import refine_points, triangulate, triangulate_points
-from deltas_geom.refine import Loss
+from deltas_geom.triangulation.refine import Loss
 
 
 def best_point(proj: Tensor, pixels: Tensor, weights: Tensor, start: Tensor, loss: Loss) -> Tensor:

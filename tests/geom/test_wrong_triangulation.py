@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom import PosedViews, triangulate_points
-from deltas_geom.fundamental import cross_matrix, inverse_intrinsics
+from deltas_geom.epipolar.fundamental import cross_matrix, inverse_intrinsics
 from deltas_geom.testing.conformance import conformance
 from deltas_geom.testing.invariants import INVARIANTS
 from deltas_geom.testing.target import ImageSize, Target

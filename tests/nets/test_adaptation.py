@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from kornia.geometry.transform import warp_perspective
 from torch import Tensor
 
-from deltas_geom.homogeneous import from_homogeneous, to_homogeneous
+from deltas_geom.cameras.homogeneous import from_homogeneous, to_homogeneous
 from deltas_nets.teachers.adaptation import adapted_scores, random_homography
 
 SIZE = (60, 80)

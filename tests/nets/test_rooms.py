@@ -10,8 +10,8 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, default_collate
 
-from deltas_geom.projection import project, unproject
-from deltas_geom.views import PosedViews
+from deltas_geom.cameras.projection import project, unproject
+from deltas_geom.cameras.views import PosedViews
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic import Rooms, draw_room, render_room, texture_atlas
 from deltas_nets.data.synthetic.cast import cast_rays

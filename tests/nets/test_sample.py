@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from deltas_geom.pixels import resize_intrinsics
+from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.data.capture import Capture, open_capture
 from deltas_nets.data.sample import depth_at_image, fit_work_size, load_views, resize_image
 from deltas_nets.data.view_sets import read_view_sets

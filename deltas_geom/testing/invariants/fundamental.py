@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.fundamental import epipolar_distance, epipolar_lines
-from deltas_geom.projection import project
+from deltas_geom.cameras.projection import project
+from deltas_geom.cameras.views import PosedViews
+from deltas_geom.epipolar.fundamental import epipolar_distance, epipolar_lines
 from deltas_geom.testing.agreement import (
     PIXEL_TOLERANCE,
     assert_finite,
@@ -15,7 +16,6 @@ from deltas_geom.testing.changes import ELSEWHERE, World, cut, transformed
 from deltas_geom.testing.registry import invariant
 from deltas_geom.testing.scenes import PosedScene
 from deltas_geom.testing.target import Target
-from deltas_geom.views import PosedViews
 
 
 @invariant("fundamental")

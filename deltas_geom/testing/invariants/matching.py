@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.pixels import pixel_grid
+from deltas_geom.cameras.pixels import pixel_grid
 from deltas_geom.testing.agreement import VALUE_TOLERANCE, assert_finite, assert_near
 from deltas_geom.testing.planar import ScoreScene
 from deltas_geom.testing.registry import invariant

@@ -3,14 +3,14 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.poses import camera_centers
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.poses import camera_centers
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.testing.agreement import EXTREMES, PIXEL_TOLERANCE, assert_finite, assert_near
 from deltas_geom.testing.changes import ELSEWHERE, World, cut, transformed
 from deltas_geom.testing.registry import invariant
 from deltas_geom.testing.scenes import PosedScene
 from deltas_geom.testing.target import Target
-from deltas_geom.views import PosedViews
 
 
 @invariant("project")

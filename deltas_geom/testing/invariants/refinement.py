@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.projection import project
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.projection import project
 from deltas_geom.testing.agreement import POINT_TOLERANCE, assert_near
 from deltas_geom.testing.invariants.triangulation import weights_for
 from deltas_geom.testing.registry import invariant

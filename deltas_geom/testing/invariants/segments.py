@@ -7,8 +7,8 @@ depths and every visible depth lies between them.
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.pixels import in_image, resize_intrinsics, resize_pixels
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.pixels import in_image, resize_intrinsics, resize_pixels
 from deltas_geom.status import Status
 from deltas_geom.testing.agreement import (
     EXTREMES,

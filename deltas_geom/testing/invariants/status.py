@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.poses import camera_centers
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.status import Status
 from deltas_geom.testing.agreement import assert_status
 from deltas_geom.testing.invariants.triangulation import weights_for

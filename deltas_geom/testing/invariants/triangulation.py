@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.poses import invert_pose
-from deltas_geom.projection import project
+from deltas_geom.cameras.poses import invert_pose
+from deltas_geom.cameras.projection import project
 from deltas_geom.testing.agreement import (
     EXTREMES,
     POINT_TOLERANCE,

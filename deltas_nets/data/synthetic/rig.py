@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from deltas_geom.views import PosedViews
+from deltas_geom.cameras.views import PosedViews
 from deltas_nets.data.synthetic.furniture import rotation
 
 Array = NDArray[np.float64]

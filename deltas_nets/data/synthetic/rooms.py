@@ -9,7 +9,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from deltas_geom.views import PosedViews
+from deltas_geom.cameras.views import PosedViews
 from deltas_nets.data.posed_images import PosedImages
 from deltas_nets.data.synthetic.render import render_view
 from deltas_nets.data.synthetic.scene import draw_room

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deltas_geom.views import PosedViews
+from deltas_geom.cameras.views import PosedViews
 from deltas_nets.data.synthetic import furniture
 from deltas_nets.data.synthetic.furniture import BOX, Solid, rotation
 from deltas_nets.data.synthetic.materials import Surfaces, draw_surfaces

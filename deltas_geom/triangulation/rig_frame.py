@@ -11,11 +11,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.chunks import surely_all
-from deltas_geom.ldl import Symmetric4, Vector4, unit
-from deltas_geom.null_vector import null_vector, rayleigh_step
-from deltas_geom.observations import Vector3, Weights, over_views
+from deltas_geom.numerics.chunks import surely_all
+from deltas_geom.numerics.ldl import Symmetric4, Vector4, unit
+from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
 from deltas_geom.status import Status
+from deltas_geom.triangulation.observed import Vector3, Weights, over_views
 
 # Of the inputs' rounding: an error of the solver that is lost in it.
 _NEGLIGIBLE = 0.01
@@ -172,7 +172,7 @@ def find_points(
         normal: ten ``(*B, N)``, of homogeneous points of :func:`in_frame`.
         frame: of the points.
         eps: rounding of the inputs, relative.
-        product: see :func:`deltas_geom.null_vector.null_vector`.
+        product: see :func:`deltas_geom.numerics.null_vector.null_vector`.
         polish: see there.
         columns: see there.
     """

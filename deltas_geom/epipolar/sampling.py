@@ -7,12 +7,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide
+from deltas_geom.cameras.pixels import in_image, normalize_pixels
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_image_size, check_shapes
-from deltas_geom.homogeneous import safe_divide
-from deltas_geom.pixels import in_image, normalize_pixels
-from deltas_geom.precision import without_autocast
-from deltas_geom.segments import Segments, epipolar_rays
-from deltas_geom.views import PosedViews
+from deltas_geom.epipolar.segments import Segments, epipolar_rays
+from deltas_geom.numerics.arithmetic import without_autocast
 
 
 class Samples(NamedTuple):

@@ -13,11 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from deltas_geom.cameras.pixels import normalizing, resize_pixels
 from deltas_geom.checks import batch_shape, check_bool, check_shapes
-from deltas_geom.pixels import normalizing, resize_pixels
-from deltas_geom.precision import at_least_single, promoted, without_autocast
-from deltas_geom.recompute import recomputed
-from deltas_geom.sampling import Samples
+from deltas_geom.epipolar.sampling import Samples
+from deltas_geom.numerics.arithmetic import at_least_single, promoted, without_autocast
+from deltas_geom.numerics.evaluation import recomputed
 
 _CACHED_ELEMENTS = 1 << 21  # a chunk should stay in the cache between writing and reading it
 _HELD_ELEMENTS = 1 << 28  # where there is no such cache: what one call may hold in memory

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import check_bool, check_floating, check_shapes
-from deltas_geom.chunks import in_chunks
-from deltas_geom.fundamental import cross_matrix
-from deltas_geom.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.observations import solver_dtype
-from deltas_geom.precision import without_autocast
+from deltas_geom.epipolar.fundamental import cross_matrix
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.chunks import in_chunks
 from deltas_geom.status import Status
+from deltas_geom.triangulation.observed import solver_dtype
 
 
 class TwoViewTriangulation(NamedTuple):

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import to_homogeneous
-from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_observed, solver_dtype
-from deltas_geom.precision import without_autocast
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.status import Status
-from deltas_geom.triangulated import RobustTriangulation
-from deltas_geom.triangulation import triangulate, triangulate_points
+from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT, check_observed, solver_dtype
+from deltas_geom.triangulation.results import RobustTriangulation
+from deltas_geom.triangulation.triangulate import triangulate, triangulate_points
 
 _BUDGET = 2**17  # distances at a time: what lies between stays in the cache
 

@@ -7,10 +7,10 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
+from deltas_geom.cameras.poses import invert_pose, is_rigid
 from deltas_geom.checks import ShapeError, batch_shape, check_shapes
-from deltas_geom.pixels import crop_intrinsics, resize_intrinsics
-from deltas_geom.poses import invert_pose, is_rigid
-from deltas_geom.precision import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
 class PosedViews(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from deltas_geom.recompute import recomputed
+from deltas_geom.numerics.evaluation import recomputed
 
 _CHUNK, _SMALLEST_CHUNK = 16384, 1024  # points
 

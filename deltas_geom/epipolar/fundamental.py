@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.cameras.poses import relative_pose
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.poses import relative_pose
-from deltas_geom.precision import promoted, without_autocast
-from deltas_geom.views import PosedViews
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
 def cross_matrix(vectors: Tensor) -> Tensor:

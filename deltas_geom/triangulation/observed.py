@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
-from deltas_geom.chunks import values_at_hand
+from deltas_geom.numerics.chunks import values_at_hand
 
 # A view whose weight is below this share of the point's largest counts as no view: its squared
 # weight, times a small parallax, would be lost in the rounding of the normal matrix.

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
+from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.checks import batch_shape, check_floating, check_shapes
-from deltas_geom.chunks import in_chunks
-from deltas_geom.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.observations import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
-from deltas_geom.poses import camera_centers
-from deltas_geom.precision import without_autocast
-from deltas_geom.reprojection import parallax_of
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.chunks import in_chunks
 from deltas_geom.status import Status
-from deltas_geom.triangulated import Triangulation
+from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
+from deltas_geom.triangulation.reprojection import parallax_of
+from deltas_geom.triangulation.results import Triangulation
 
 _Vector = tuple[Tensor, ...]
 """Three components, each of any shape."""

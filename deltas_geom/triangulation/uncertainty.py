@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
-from deltas_geom.normal_matrix import Symmetric3, inverse3, normal_matrix
-from deltas_geom.observations import (
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.triangulation.dlt import Symmetric3, inverse3, normal_matrix
+from deltas_geom.triangulation.observed import (
     Cameras,
     Vector3,
     cameras_of,
@@ -14,8 +15,7 @@ from deltas_geom.observations import (
     solver_dtype,
     weigh,
 )
-from deltas_geom.precision import without_autocast
-from deltas_geom.reprojection import Reprojection, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
 
 
 @without_autocast

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.ldl import Symmetric4
-from deltas_geom.observations import NEGLIGIBLE_WEIGHT, projection_centers, solver_dtype
-from deltas_geom.rig_frame import RigFrame, camera_moments, rig_frame
+from deltas_geom.numerics.ldl import Symmetric4
+from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT, projection_centers, solver_dtype
+from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame
 
 
 class Listed(NamedTuple):

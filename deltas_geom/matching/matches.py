@@ -10,11 +10,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import check_bool, check_shapes
-from deltas_geom.homogeneous import safe_divide
-from deltas_geom.precision import without_autocast
-from deltas_geom.sampling import Samples, sample_inv_depths
-from deltas_geom.views import PosedViews
+from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
+from deltas_geom.numerics.arithmetic import without_autocast
 
 
 class Matches(NamedTuple):

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.precision import without_autocast
+from deltas_geom.numerics.arithmetic import without_autocast
 
 
 @without_autocast

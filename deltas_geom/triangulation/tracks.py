@@ -9,13 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import ShapeError, check_floating, check_index, check_shapes
-from deltas_geom.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.ldl import Vector4
-from deltas_geom.observations import Vector3
-from deltas_geom.precision import without_autocast
-from deltas_geom.recompute import recomputed
-from deltas_geom.rig_frame import (
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.evaluation import recomputed
+from deltas_geom.numerics.ldl import Vector4
+from deltas_geom.status import Status
+from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.triangulation.rig_frame import (
     FoundPoints,
     derivable_points,
     find_points,
@@ -23,8 +24,13 @@ from deltas_geom.rig_frame import (
     judge_points,
     kept,
 )
-from deltas_geom.status import Status
-from deltas_geom.track_equations import PosedTracks, at, pose_tracks, project_listed, summed
+from deltas_geom.triangulation.track_equations import (
+    PosedTracks,
+    at,
+    pose_tracks,
+    project_listed,
+    summed,
+)
 
 
 class TriangulatedTracks(NamedTuple):

@@ -9,7 +9,7 @@ Source: Golub and Van Loan, 4th ed., sections 8.1.3 (bounds) and 8.2 (inverse it
 import torch
 from torch import Tensor
 
-from deltas_geom.ldl import (
+from deltas_geom.numerics.ldl import (
     Symmetric4,
     Vector3,
     Vector4,

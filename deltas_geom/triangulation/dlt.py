@@ -10,7 +10,7 @@ Source: Hartley and Zisserman, 2nd ed., section 12.2.
 import torch
 from torch import Tensor
 
-from deltas_geom.observations import Vector3, over_views
+from deltas_geom.triangulation.observed import Vector3, over_views
 
 
 def normal_matrix(proj: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[Tensor, ...]:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.observations import Vector3
+from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
+from deltas_geom.triangulation.observed import Vector3
 
 
 class Reprojection(NamedTuple):

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.ldl import Symmetric4, Vector4, dot, multiply, unit
-from deltas_geom.normal_matrix import alike_coefficients, alike_normal_matrix, normal_matrix
-from deltas_geom.null_vector import solve_in_complement
-from deltas_geom.observations import (
+from deltas_geom.numerics.ldl import Symmetric4, Vector4, dot, multiply, unit
+from deltas_geom.numerics.null_vector import solve_in_complement
+from deltas_geom.triangulation.dlt import alike_coefficients, alike_normal_matrix, normal_matrix
+from deltas_geom.triangulation.observed import (
     Cameras,
     Observations,
     Vector3,
@@ -20,7 +20,7 @@ from deltas_geom.observations import (
     over_views,
     weigh_pixels,
 )
-from deltas_geom.rig_frame import (
+from deltas_geom.triangulation.rig_frame import (
     RigFrame,
     derivable_vector,
     in_frame,
@@ -78,7 +78,7 @@ def prepared(
 
     Args:
         proj: ``(*B, V, 3, 4)``.
-        weights: see :func:`deltas_geom.observations.weigh`.
+        weights: see :func:`deltas_geom.triangulation.observed.weigh`.
         mask: see there.
         kind: of the frames, "rig" or "world".
     """

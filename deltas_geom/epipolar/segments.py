@@ -10,14 +10,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.cameras.poses import relative_pose
+from deltas_geom.cameras.projection import pixel_rays
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
-from deltas_geom.fundamental import inverse_intrinsics
-from deltas_geom.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.poses import relative_pose
-from deltas_geom.precision import promoted, without_autocast
-from deltas_geom.projection import pixel_rays
+from deltas_geom.epipolar.fundamental import inverse_intrinsics
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 from deltas_geom.status import Status
-from deltas_geom.views import PosedViews
 
 # A point counts as in front of the source if it lies before its plane by more than this power of
 # eps times its distance from the anchor plus the baseline. On the plane a pixel is a quotient of

@@ -11,12 +11,23 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.checks import batch_shape, check_floating, check_shapes
-from deltas_geom.chunks import in_chunks
-from deltas_geom.homogeneous import safe_sqrt
-from deltas_geom.normal_matrix import Symmetric3, normal_matrix, second_derivative, solve3_scaled
-from deltas_geom.observations import Observations, Vector3, check_weights, observe, over_views
-from deltas_geom.precision import without_autocast
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.chunks import in_chunks
+from deltas_geom.triangulation.dlt import (
+    Symmetric3,
+    normal_matrix,
+    second_derivative,
+    solve3_scaled,
+)
+from deltas_geom.triangulation.observed import (
+    Observations,
+    Vector3,
+    check_weights,
+    observe,
+    over_views,
+)
 
 Loss = Literal["squared", "huber", "cauchy"]
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.precision import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
 @without_autocast

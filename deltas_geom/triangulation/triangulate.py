@@ -10,8 +10,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.chunks import in_chunks, surely_all
-from deltas_geom.equations import (
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.chunks import in_chunks, surely_all
+from deltas_geom.numerics.evaluation import WithLagrangian
+from deltas_geom.numerics.ldl import Vector4
+from deltas_geom.status import Status
+from deltas_geom.triangulation.equations import (
     Alike,
     Posed,
     columns_of,
@@ -20,12 +24,10 @@ from deltas_geom.equations import (
     prepared,
     product_of,
 )
-from deltas_geom.ldl import Vector4
-from deltas_geom.observations import Cameras, Observations, Vector3, check_observed
-from deltas_geom.precision import without_autocast
-from deltas_geom.recompute import WithLagrangian
-from deltas_geom.reprojection import in_views, parallax_of, reproject, residual_of
-from deltas_geom.rig_frame import (
+from deltas_geom.triangulation.observed import Cameras, Observations, Vector3, check_observed
+from deltas_geom.triangulation.reprojection import in_views, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.results import Triangulation
+from deltas_geom.triangulation.rig_frame import (
     FoundPoints,
     derivable_points,
     find_points,
@@ -34,9 +36,7 @@ from deltas_geom.rig_frame import (
     kept,
     kept_in_world,
 )
-from deltas_geom.status import Status
-from deltas_geom.triangulated import Triangulation
-from deltas_geom.uncertainty import covariance_of, representable, unpacked3
+from deltas_geom.triangulation.uncertainty import covariance_of, representable, unpacked3
 
 
 @without_autocast

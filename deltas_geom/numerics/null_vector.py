@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.chunks import surely_all, values_at_hand
-from deltas_geom.ldl import (
+from deltas_geom.numerics.chunks import surely_all, values_at_hand
+from deltas_geom.numerics.ldl import (
     Factors,
     Symmetric4,
     Vector4,
@@ -34,7 +34,7 @@ from deltas_geom.ldl import (
     start,
     unit,
 )
-from deltas_geom.proof import proved_vector
+from deltas_geom.numerics.proof import proved_vector
 
 # After the start. One is enough for good matches; gross outliers bring eigenvalues near.
 _INVERSE_ITERATIONS = 2

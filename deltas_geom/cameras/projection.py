@@ -5,11 +5,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.cameras.poses import invert_pose
+from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.poses import invert_pose
-from deltas_geom.precision import promoted, without_autocast
-from deltas_geom.views import PosedViews
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
 class Projection(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_image_size, check_shapes
-from deltas_geom.precision import without_autocast
+from deltas_geom.numerics.arithmetic import without_autocast
 
 
 def pixel_grid(

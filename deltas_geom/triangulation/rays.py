@@ -11,21 +11,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
+from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.checks import check_floating, check_shapes
-from deltas_geom.chunks import in_chunks
-from deltas_geom.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.ldl import Symmetric4, Vector4
-from deltas_geom.observations import (
+from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.chunks import in_chunks
+from deltas_geom.numerics.ldl import Symmetric4, Vector4
+from deltas_geom.status import Status
+from deltas_geom.triangulation.observed import (
     Vector3,
     Weights,
     check_weights,
     solver_dtype,
     weigh,
 )
-from deltas_geom.poses import camera_centers
-from deltas_geom.precision import without_autocast
-from deltas_geom.reprojection import parallax_of
-from deltas_geom.rig_frame import (
+from deltas_geom.triangulation.reprojection import parallax_of
+from deltas_geom.triangulation.results import Triangulation
+from deltas_geom.triangulation.rig_frame import (
     FoundPoints,
     RigFrame,
     derivable_points,
@@ -35,8 +37,6 @@ from deltas_geom.rig_frame import (
     kept,
     rig_frames,
 )
-from deltas_geom.status import Status
-from deltas_geom.triangulated import Triangulation
 
 
 @without_autocast

@@ -1,0 +1,1 @@
+"""Pixels, poses, posed views, and the way between points and pixels."""

@@ -1,0 +1,1 @@
+"""Where a pixel of one view can be in another: lines, segments, samples along them."""

@@ -1,0 +1,1 @@
+"""Which sample looks like the keypoint: correlation, expectation, matches of one or all views."""
