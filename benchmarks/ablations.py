@@ -20,17 +20,17 @@ from typing import Any, NamedTuple
 
 import torch
 
-from deltas_nets.checked_inputs import encoder_file
+from deltas_nets.commands.train import encoder_file
 from deltas_nets.config import DataConfig, TrainConfig
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import gmacs
-from deltas_nets.data.posed_images import PosedImages
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
-from deltas_nets.pretrained import load_model
 from deltas_nets.train.data_sets import training_data
 from deltas_nets.train.fit import fit
 from deltas_nets.train.start import Start
 from deltas_nets.train.step import DEPTH_RANGE
+from deltas_nets.weights_file import load_model
 
 SIZE = (144, 192)
 VIEWS = 3  # of the rooms to score on

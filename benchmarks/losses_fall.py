@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_nets.config import TRAIN_CONFIGS, DataConfig, TrainConfig
-from deltas_nets.losses import Losses
+from deltas_nets.losses.losses import Losses
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.loader import room_loader

@@ -19,9 +19,11 @@ from kornia.feature import gftt_response
 from skimage.feature import ORB
 from torch import Tensor
 
-from deltas_nets.checked_inputs import usable_view_sets
-from deltas_nets.data.capture import Capture, open_capture
-from deltas_nets.data.sample import depth_at_image, fit_work_size, load_views
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.usable import usable_view_sets
+from deltas_nets.captures.work_size import depth_at_image, fit_work_size, load_views
+from deltas_nets.distill.teachers import load_teacher
 from deltas_nets.evaluate.capture import resize_nearest
 from deltas_nets.evaluate.repeatability import (
     NUM_POINTS,
@@ -31,9 +33,8 @@ from deltas_nets.evaluate.repeatability import (
     repeatability,
     strongest_points,
 )
-from deltas_nets.network.detector import detector_heatmap, spread_points
-from deltas_nets.pretrained import load_model
-from deltas_nets.teachers import load_teacher
+from deltas_nets.network.lite.detector import detector_heatmap, spread_points
+from deltas_nets.weights_file import load_model
 
 Detect = Callable[[Tensor], Tensor]  # image (3, H, W) to points (N, 2)
 

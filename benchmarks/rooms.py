@@ -10,7 +10,7 @@ import time
 
 import torch
 
-from deltas_nets.data.synthetic import render_room, texture_atlas
+from deltas_nets.rooms import render_room, texture_atlas
 
 NUM_VIEWS = 5
 IMAGE_SIZE = (144, 192)

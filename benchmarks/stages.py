@@ -14,11 +14,12 @@ import torch
 
 from deltas_geom import soft_argmax
 from deltas_nets import load_model, open_capture
-from deltas_nets.data.sample import depth_at_image
-from deltas_nets.data.view_sets import read_view_sets
+from deltas_nets.captures.view_sets import read_view_sets
+from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, depth_metrics, mean_metrics
 from deltas_nets.evaluate.points import point_depths, score_points
-from deltas_nets.predict import PredictConfig, predict_frame
+from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.ours import predict_frame
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ import torch
 
 from deltas_geom import PosedViews
 from deltas_nets.config import CONFIGS, PAPER_LOSS
-from deltas_nets.losses import training_losses
+from deltas_nets.losses.losses import training_losses
 from deltas_nets.network.deltas import Deltas
 
 

@@ -9,10 +9,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from deltas_nets.captures.opening import open_capture
     from deltas_nets.config import NetworkConfig
-    from deltas_nets.data.capture import open_capture
     from deltas_nets.network.deltas import Deltas, DepthPrediction
-    from deltas_nets.pretrained import load_model
+    from deltas_nets.weights_file import load_model
 
 __version__ = "0.1.0"
 
@@ -22,8 +22,8 @@ _HOMES = {
     "Deltas": "deltas_nets.network.deltas",
     "DepthPrediction": "deltas_nets.network.deltas",
     "NetworkConfig": "deltas_nets.config",
-    "load_model": "deltas_nets.pretrained",
-    "open_capture": "deltas_nets.data.capture",
+    "load_model": "deltas_nets.weights_file",
+    "open_capture": "deltas_nets.captures.capture",
 }
 
 

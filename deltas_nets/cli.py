@@ -7,7 +7,6 @@ import contextlib
 import io
 import re
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import shorten
 from typing import Annotated, NoReturn, get_args
@@ -15,131 +14,18 @@ from typing import Annotated, NoReturn, get_args
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.cli_calibrate import Calibrate
-from deltas_nets.cli_distill import Distill
-from deltas_nets.cli_evaluate import Evaluate
-from deltas_nets.cli_export import Export
-from deltas_nets.cli_prediction import Prediction
-from deltas_nets.cli_recipe import Recipe
-from deltas_nets.cli_training import Cost, Flag, Train, preset_of
-from deltas_nets.config import TRAIN_CONFIGS, to_dict
+from deltas_nets.commands.calibrate import Calibrate
+from deltas_nets.commands.cost import Cost
+from deltas_nets.commands.demo import Demo
+from deltas_nets.commands.depth import Depth
+from deltas_nets.commands.distill import Distill
+from deltas_nets.commands.evaluate import Evaluate
+from deltas_nets.commands.export import Export
+from deltas_nets.commands.recipe import Recipe
+from deltas_nets.commands.train import Train, preset_of
+from deltas_nets.config import TRAIN_CONFIGS
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, stopped_like_ctrl_c, warn
-
-
-@dataclass(frozen=True)
-class Demo(Prediction):
-    """Depth of a real stereo pair, with its errors: does everything work here?
-
-    Runs the shipped weights on the Middlebury motorcycle pair that scikit-image carries,
-    prints errors and times, and writes depth, confidence, points and a figure.
-
-    Example: deltas demo --out demo
-    """
-
-    out: Path = Path("deltas-demo")
-    """Folder to write to."""
-    overwrite: Flag = False
-    """Write into a folder that holds other things."""
-
-    def run(self) -> None:
-        """Do it."""
-        from deltas_nets.demo import run_demo
-        from deltas_nets.network.deltas import Deltas
-
-        network = self.network()
-        if not isinstance(network, Deltas):
-            what = "the demo draws stages that the published network does not have"
-            raise UserError(what, self.weights, "use deltas depth")
-        run_demo(network, self.config(), self.out, self.weights, overwrite=self.overwrite)
-
-
-@dataclass(frozen=True)
-class Depth(Prediction):
-    """Write a metric depth map for every frame of a posed capture.
-
-    The capture is a folder in ScanNet's export layout: color/N.jpg, pose/N.txt,
-    intrinsic/intrinsic_color.txt. Writes DIR/depth/N.png (16-bit millimetres),
-    DIR/confidence/N.png, DIR/points/N.ply and DIR/summary.json. The network that the authors of the
-    paper published states no confidence, so with its checkpoint none is written.
-
-    Example: deltas depth my_capture --out depth --views 5
-    """
-
-    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
-        kw_only=True
-    )
-    """Folder with images, poses and intrinsics, or a folder with one such scene inside."""
-    out: Path = field(kw_only=True)
-    """Folder to write to; the same command continues a run that was stopped."""
-    view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen by baseline and overlap if not
-    given."""
-    views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Views per depth map, the anchor included; all of the view sets', or 5, if not given."""
-    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
-    """Size of the maps; the colour image's if not given."""
-    min_confidence: float = 0.0
-    """Leave out pixels of less confidence, 0 to 1."""
-    shard: str = "1/1"
-    """I/N: this run does every N-th frame from the I-th, for N runs at once."""
-    overwrite: Flag = False
-    """Start again instead of continuing, or write into a folder that holds other things."""
-
-    def run(self) -> None:
-        """Do it."""
-        import torch
-
-        from deltas_nets.any_network import file_record, network_record
-        from deltas_nets.checked_inputs import (
-            check_all,
-            read_shard,
-            usable_view_sets,
-            warn_of,
-        )
-        from deltas_nets.data.capture import open_capture
-        from deltas_nets.outputs import prepare_output
-        from deltas_nets.predict import check_asked, states_confidence
-        from deltas_nets.predict_capture import predict_capture
-
-        shard = read_shard(self.shard)
-        config = self.config(size=self.size, min_confidence=self.min_confidence)
-        capture = open_capture(self.capture)
-        view_sets = usable_view_sets(capture, self.view_sets, self.views)
-        check_all(capture, view_sets)
-        warn_of(capture, view_sets, self.view_sets, self.depth_range)
-        network = self.network()
-        check_asked(network, config, capture, view_sets)
-        mine = view_sets[shard[0] - 1 :: shard[1]]
-        folder = prepare_output(
-            self.out,
-            settings={
-                "predict": to_dict(config),
-                "network": network_record(network),
-                "weights": file_record(self.weights, network),
-                "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
-                "precision": self.precision,
-                "views": self.views,
-                "view_sets": view_sets,
-            },
-            overwrite=self.overwrite,
-            forbidden=capture.path,
-            shard=shard,
-            frame_ids=[views.anchor for views in mine],
-            confidence=states_confidence(network),
-            head={
-                "versions": {"deltas-depth": __version__, "torch": torch.__version__},
-                "lost_poses": sorted(capture.lost),
-            },
-        )
-        with progress("depth", len(mine)) as report:
-            counts = predict_capture(network, capture, mine, folder, config, report=report)
-        kept = f", {counts.kept} kept from an earlier run" if counts.kept else ""
-        print(f"{counts.written} depth maps in {self.out}{kept}")
-        if not states_confidence(network):
-            print("no confidence is written: the published network states none")
-        if counts.blind:
-            warn(f"{counts.blind} maps without a triangulated point are guesses: see summary.json")
+from deltas_nets.terminal import stopped_like_ctrl_c
 
 
 def main() -> None:

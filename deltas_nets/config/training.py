@@ -7,7 +7,7 @@ import tyro
 
 from deltas_nets.config.checks import check_at_least, check_positive, check_seed, check_share
 from deltas_nets.config.network import NetworkConfig
-from deltas_nets.data.scannet_config import ScanNetConfig
+from deltas_nets.config.scannet import ScanNetConfig
 
 
 @dataclass(frozen=True)

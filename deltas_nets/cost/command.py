@@ -8,12 +8,12 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from deltas_nets.atomic_files import write_json
 from deltas_nets.cost.literature import PAPER_SETTING
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
 from deltas_nets.errors import UserError
-from deltas_nets.network.detector import CELL
+from deltas_nets.network.lite.detector import CELL
+from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.reference import ReferenceNetwork
 from deltas_nets.terminal import warn
 

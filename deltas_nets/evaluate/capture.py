@@ -8,10 +8,9 @@ import numpy as np
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from deltas_nets.data.capture import Capture, Frame
-from deltas_nets.data.sample import depth_at_image
-from deltas_nets.data.view_sets import ViewSet
-from deltas_nets.encoded_frames import EncodedFrames
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.points import score_keypoints
@@ -19,15 +18,10 @@ from deltas_nets.evaluate.scores import CaptureScores as CaptureScores
 from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
 from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.outputs import read_depth_png
-from deltas_nets.predict import (
-    KeypointDepths,
-    PredictConfig,
-    keypoint_depths,
-    predict_frame,
-    predict_map,
-    remembering,
-)
+from deltas_nets.outputs.products import read_depth_png
+from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, keypoint_depths
+from deltas_nets.predict.encoded_frames import EncodedFrames
+from deltas_nets.predict.ours import predict_frame, predict_map, remembering
 from deltas_nets.reference import ReferenceNetwork
 
 

@@ -7,8 +7,8 @@ import torch
 
 from deltas_nets.evaluate.calibration import Calibration, CalibrationMeter
 from deltas_nets.evaluate.rooms import RoomViews, measure_rooms
-from deltas_nets.network.calibration import NUM_KNOTS, Curve
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.lite.calibration import NUM_KNOTS, Curve
 
 LEAST_SLOPE = 0.05
 """Of the curve, log over log: where the prediction says nothing about the error, the order of
@@ -51,8 +51,8 @@ def fit_calibration(
 
     Args:
         model: trained; only its calibration changes.
-        rooms: to fit on, for each of :data:`deltas_nets.network.calibration.VIEWS` some with so
-            many views. Never those that are reported on, and never real captures, whose figures
+        rooms: to fit on, for each of :data:`deltas_nets.network.lite.calibration.VIEWS` some with
+            so many views. Never those that are reported on, and never real captures, whose figures
             would no longer say how the network does on captures it has not seen.
         depth_range: (near, far) metres.
         report: called after each room.

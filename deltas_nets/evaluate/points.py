@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, depth_metrics
+from deltas_nets.losses.targets import read_nearest
 from deltas_nets.network.deltas import DepthPrediction
-from deltas_nets.predict import KeypointDepths, keypoint_depths
-from deltas_nets.targets import read_nearest
+from deltas_nets.predict.depth_map import KeypointDepths, keypoint_depths
 
 
 def score_points(

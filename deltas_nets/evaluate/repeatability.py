@@ -26,7 +26,7 @@ from torch import Tensor
 
 from deltas_geom import PosedViews, in_image, project, unproject
 from deltas_geom.checks import check_shapes
-from deltas_nets.targets import read_nearest
+from deltas_nets.losses.targets import read_nearest
 
 TOLERANCE = 3.0  # px
 NUM_POINTS = 300

@@ -9,16 +9,16 @@ from torch.utils.data import Dataset
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.augment import Photometry, disturb_poses, draw_pose_errors
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import Rooms
-from deltas_nets.data.workers import rendered_ahead
+from deltas_nets.datasets.augment import Photometry, disturb_poses, draw_pose_errors
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.datasets.workers import rendered_ahead
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
 from deltas_nets.evaluate.points import score_points
 from deltas_nets.evaluate.scores import CaptureScores, MapScores, mean_scores, score_map
+from deltas_nets.losses.targets import read_nearest
 from deltas_nets.network.deltas import Deltas, DepthPrediction
-from deltas_nets.targets import read_nearest
+from deltas_nets.rooms import Rooms
 
 EVALUATION_SEEDS, CALIBRATION_SEEDS = range(500), range(500, 1000)
 """Rooms to report on and rooms to calibrate with; those of training have seeds from 1000."""

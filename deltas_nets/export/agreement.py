@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import render_room
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.export.graph import OUTPUTS, ExportConfig, FixedDeltas
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.rooms import render_room
 
 TOLERANCE = 1e-3
 """Largest relative difference of depth at any pixel."""

@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.export import ExportedProgram
 
 from deltas_nets import __version__
-from deltas_nets.atomic_files import plain, write_atomically
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.export.agreement import Agreement, Inputs, check_agreement
@@ -28,6 +27,7 @@ from deltas_nets.export.graph import (
     without_paths,
 )
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.outputs.atomic_files import plain, write_atomically
 
 METADATA_FILE = "deltas.json"
 """Where a .pt2 file keeps what an .onnx file keeps as its metadata."""

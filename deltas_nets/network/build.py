@@ -3,22 +3,22 @@
 from typing import NamedTuple
 
 from deltas_nets.config import MatcherConfig, NetworkConfig
-from deltas_nets.network.densifier import Densifier
-from deltas_nets.network.descriptor import Descriptor
-from deltas_nets.network.detector import Detector
-from deltas_nets.network.encoder import Encoder
-from deltas_nets.network.judge import Judge
-from deltas_nets.network.matcher import JointMatcher
-from deltas_nets.network.paper import (
+from deltas_nets.network.joint.judge import Judge
+from deltas_nets.network.joint.matcher import JointMatcher
+from deltas_nets.network.lite.densifier import Densifier
+from deltas_nets.network.lite.descriptor import Descriptor
+from deltas_nets.network.lite.detector import Detector
+from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.paper.paper import (
     PaperDensifier,
     PaperDescriptor,
     PaperDetector,
     PaperEncoder,
 )
-from deltas_nets.network.per_view_matcher import PerViewMatcher
-from deltas_nets.network.resnet import ResNet50
-from deltas_nets.network.taps import Backbone
-from deltas_nets.network.vgg import VGG9
+from deltas_nets.network.paper.per_view_matcher import PerViewMatcher
+from deltas_nets.network.paper.resnet import ResNet50
+from deltas_nets.network.paper.taps import Backbone
+from deltas_nets.network.paper.vgg import VGG9
 
 Matcher = JointMatcher | PerViewMatcher
 

@@ -17,12 +17,12 @@ from deltas_geom import (
 from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
 from deltas_nets.config import NetworkConfig
 from deltas_nets.network.build import build_stages
-from deltas_nets.network.calibration import SpreadCalibration
-from deltas_nets.network.densifier import DenseDepth
-from deltas_nets.network.detector import Keypoints
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.layers import upsample_to
-from deltas_nets.network.matcher import Posterior
+from deltas_nets.network.lite.calibration import SpreadCalibration
+from deltas_nets.network.lite.densifier import DenseDepth
+from deltas_nets.network.lite.detector import Keypoints
+from deltas_nets.network.records import Posterior
 
 
 class Evidence(NamedTuple):

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from deltas_nets.network.descriptor import Descriptors
-from deltas_nets.network.encoder import Features
-from deltas_nets.network.paper import ViewTaps
+from deltas_nets.network.features import Features
+from deltas_nets.network.lite.descriptor import Descriptors
+from deltas_nets.network.paper.paper import ViewTaps
 
 
 class Encoded(NamedTuple):

@@ -216,7 +216,7 @@ DIFFERENCES = (
         "Training",
         "five losses",
         "not published",
-        "written from the paper; terms and weights are in `deltas_nets.losses`",
+        "written from the paper; terms and weights are in `deltas_nets.losses.losses`",
     ),
     Difference(
         27,

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from deltas_nets.network.detector import CELL, detector_heatmap
-from deltas_nets.network.taps import Taps
+from deltas_nets.network.lite.detector import CELL, detector_heatmap
+from deltas_nets.network.paper.taps import Taps
 from deltas_nets.reference.outputs import FeatureOutputs, ReferenceFeatures
 
 

@@ -7,17 +7,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom.checks import ShapeError
-from deltas_nets.network.detector import CELL
-from deltas_nets.network.resnet import ResNet50
-from deltas_nets.network.sparse_densifier import (
+from deltas_nets.network.lite.detector import CELL
+from deltas_nets.network.paper.resnet import ResNet50
+from deltas_nets.network.paper.sparse_densifier import (
     DecoderMaps,
     DepthScales,
     SparseDensifier,
     join_taps,
 )
-from deltas_nets.network.superpoint_head import DescriptorHead, DetectorHead
-from deltas_nets.network.taps import Taps, imagenet_normalised
-from deltas_nets.network.up_projection import insert_zeros
+from deltas_nets.network.paper.superpoint_head import DescriptorHead, DetectorHead
+from deltas_nets.network.paper.taps import Taps, imagenet_normalised
+from deltas_nets.network.paper.up_projection import insert_zeros
 from deltas_nets.reference.batch import batch_and_views
 from deltas_nets.reference.features import heatmap_of, shown_features
 from deltas_nets.reference.keypoints import DetectedKeypoints, fill_keypoints, pick_keypoints

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from deltas_nets.network.superpoint_head import DescriptorStages, DetectorStages
-from deltas_nets.network.taps import Taps
+from deltas_nets.network.paper.superpoint_head import DescriptorStages, DetectorStages
+from deltas_nets.network.paper.taps import Taps
 
 
 class ReferenceFeatures(NamedTuple):

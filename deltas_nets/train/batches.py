@@ -13,7 +13,7 @@ from torch import Tensor
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.augment import (
+from deltas_nets.datasets.augment import (
     Photometry,
     choose_views,
     disturb_poses,
@@ -22,7 +22,7 @@ from deltas_nets.data.augment import (
     mirror,
     resize,
 )
-from deltas_nets.data.posed_images import PosedImages
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.train.loader import ALL, Part
 
 

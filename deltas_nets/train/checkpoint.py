@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import torch
 
-from deltas_nets.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
+from deltas_nets.distill.teachers import LICENCES
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import save_weights
-from deltas_nets.teachers import LICENCES
+from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.train.average import RunningAverage
+from deltas_nets.weights_file import save_weights
 
 CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetensors"
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from torch.utils.data import Subset
 
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.scannet_tuples import ScanNetTuples, open_scannet
-from deltas_nets.data.synthetic import Rooms
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.datasets.tuples import ScanNetTuples, open_scannet
+from deltas_nets.rooms import Rooms
 
 
 def training_data(

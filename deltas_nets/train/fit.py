@@ -9,10 +9,10 @@ from torch import nn
 from torch.utils.data import Subset
 
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import Rooms
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.rooms import evaluate_rooms
+from deltas_nets.rooms import Rooms
 from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.checkpoint import WEIGHTS, remove_half_written, save_run
 from deltas_nets.train.data_sets import training_data, validation_data

@@ -12,11 +12,11 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
 from deltas_nets.config import TrainConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.scannet_tuples import ScanNetTuples
-from deltas_nets.data.synthetic import Rooms
-from deltas_nets.data.workers import leave_to_the_parent
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.datasets.tuples import ScanNetTuples
+from deltas_nets.datasets.workers import leave_to_the_parent
 from deltas_nets.errors import UserError
+from deltas_nets.rooms import Rooms
 from deltas_nets.train.data_sets import training_data
 from deltas_nets.train.shelves import Shelves, places_with_new_rooms
 

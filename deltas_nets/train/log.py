@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from deltas_nets.atomic_files import plain, write_atomically
 from deltas_nets.config import TrainConfig, to_dict
+from deltas_nets.outputs.atomic_files import plain, write_atomically
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from deltas_nets.atomic_files import write_json
 from deltas_nets.config.recipes import Recipe, RecipeName
 from deltas_nets.errors import UserError
-from deltas_nets.pretrained import load_model, read_metadata, save_weights
+from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.train.checkpoint import CHECKPOINT
 from deltas_nets.train.fit import fit
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.start import Start
+from deltas_nets.weights_file import load_model, read_metadata, save_weights
 
 RECORD = "recipe.json"
 

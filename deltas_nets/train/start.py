@@ -9,11 +9,10 @@ import torch
 from torch import nn
 
 from deltas_nets.config import TrainConfig
+from deltas_nets.distill.supervision import TeacherLabels
+from deltas_nets.distill.teachers import load_teacher
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import read_metadata, start_from_weights
-from deltas_nets.teachers import load_teacher
-from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batch_norm import prepare_batch_norm
 from deltas_nets.train.checkpoint import RunState, load_run
@@ -21,6 +20,7 @@ from deltas_nets.train.freeze import frozen_stages
 from deltas_nets.train.optimiser import make_optimizer
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.step import unreached
+from deltas_nets.weights_file import read_metadata, start_from_weights
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

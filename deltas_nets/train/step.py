@@ -10,10 +10,16 @@ from torch import Tensor, nn
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TrainConfig
-from deltas_nets.counts import WHOLE, Counts, CountsOverProcesses, CountsToCome, KnownCounts
-from deltas_nets.losses import Losses, training_losses
+from deltas_nets.distill.supervision import TeacherLabels
+from deltas_nets.losses.divisors import (
+    WHOLE,
+    Counts,
+    CountsOverProcesses,
+    CountsToCome,
+    KnownCounts,
+)
+from deltas_nets.losses.losses import Losses, training_losses
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.batch_norm import Statistics
 from deltas_nets.train.batches import Batch
 

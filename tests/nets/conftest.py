@@ -10,10 +10,11 @@ from PIL import Image
 from run_command import Run, runner
 
 from deltas_geom import PosedViews
-from deltas_nets.atomic_files import write_depth_png
-from deltas_nets.data.capture import Capture, open_capture
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import render_room
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.outputs.products import write_depth_png
+from deltas_nets.rooms import render_room
 
 MakeCapture = Callable[..., Path]
 

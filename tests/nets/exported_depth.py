@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from deltas_nets.data.synthetic import render_room
 from deltas_nets.export import ExportConfig
 from deltas_nets.export.agreement import TOLERANCE, Inputs, inputs_of, relative_difference
+from deltas_nets.rooms import render_room
 
 SIZE = (64, 96)
 CPU = torch.device("cpu")

@@ -41,9 +41,9 @@ from deltas_nets.config import (
     from_dict,
     to_dict,
 )
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import Rooms
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit

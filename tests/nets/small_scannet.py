@@ -6,12 +6,12 @@ from pathlib import Path
 import torch
 
 from deltas_geom import in_image, project, unproject
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.scannet_config import ScanNetConfig
-from deltas_nets.data.scannet_tuples import ScanNetTuples, open_scannet
-from deltas_nets.data.view_sets import ViewSet
-from deltas_nets.targets import read_nearest
+from deltas_nets.config.scannet import ScanNetConfig
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.datasets.tuples import ScanNetTuples, open_scannet
+from deltas_nets.losses.targets import read_nearest
 
 SIZE = (48, 64)
 SCANNET = ScanNetConfig(gap=2)

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from deltas_nets import cli, load_model
-from deltas_nets.data.capture import open_capture
-from deltas_nets.data.view_choice import choose_view_sets
-from deltas_nets.data.view_sets import read_view_sets
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.captures.view_sets import read_view_sets
 from deltas_nets.evaluate.capture import CaptureScores, evaluate_network
-from deltas_nets.predict import PredictConfig
+from deltas_nets.predict.depth_map import PredictConfig
 
 pytestmark = pytest.mark.shared
 

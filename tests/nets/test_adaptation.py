@@ -7,7 +7,7 @@ from kornia.geometry.transform import warp_perspective
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import from_homogeneous, to_homogeneous
-from deltas_nets.teachers.adaptation import adapted_scores, random_homography
+from deltas_nets.distill.adaptation import adapted_scores, random_homography
 
 SIZE = (60, 80)
 seeds = st.integers(0, 10_000)

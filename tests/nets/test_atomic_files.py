@@ -7,8 +7,8 @@ from typing import IO
 
 import pytest
 
-from deltas_nets.atomic_files import write_atomically, write_json
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.atomic_files import write_atomically, write_json
 
 
 def test_the_content_is_on_the_disk_before_its_name_and_the_name_at_the_end(

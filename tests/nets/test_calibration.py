@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from run_command import Run, assert_one_line
 
 from deltas_nets import load_model
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.config import DetectorConfig, NetworkConfig
-from deltas_nets.data.capture import open_capture
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import Rooms
-from deltas_nets.data.view_choice import choose_view_sets
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.capture import evaluate_network
@@ -28,10 +27,12 @@ from deltas_nets.evaluate.rooms import (
     DisturbedRooms,
     held_out_rooms,
 )
-from deltas_nets.network.calibration import NUM_KNOTS, VIEWS, Curve, SpreadCalibration
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.predict import PredictConfig, frames_of, predict_frame
-from deltas_nets.pretrained import load_weights, read_metadata, save_weights
+from deltas_nets.network.lite.calibration import NUM_KNOTS, VIEWS, Curve, SpreadCalibration
+from deltas_nets.predict.depth_map import PredictConfig, frames_of
+from deltas_nets.predict.ours import predict_frame
+from deltas_nets.rooms import Rooms
+from deltas_nets.weights_file import load_weights, read_metadata, save_weights
 
 MakeCapture = Callable[..., Path]
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from stand_in_device import DEVICE, on_device, one_device
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from deltas_nets.data.augment import Photometry
-from deltas_nets.data.camera_effects import (
+from deltas_nets.datasets.augment import Photometry
+from deltas_nets.datasets.camera_effects import (
     CORNER_SIGMA,
     RandomCornerBlur,
     RandomRollingExposure,

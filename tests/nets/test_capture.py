@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from deltas_nets.data.capture import Capture, open_capture
-from deltas_nets.data.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.readers.scannet import world_from_cam_inverse
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]

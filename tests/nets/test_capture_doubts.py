@@ -12,9 +12,10 @@ from PIL import Image
 from run_command import Run, assert_one_line
 from small_scannet import SCANNET, opened
 
-from deltas_nets.data.capture import Capture, Frame, open_capture
-from deltas_nets.data.readers.intrinsics import read_intrinsics
-from deltas_nets.data.view_sets import ViewSet, doubtful_scale
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.readers.intrinsics import read_intrinsics
+from deltas_nets.captures.view_sets import ViewSet, doubtful_scale
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]

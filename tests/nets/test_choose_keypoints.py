@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from deltas_nets.config import DetectorConfig
-from deltas_nets.network.detector import (
+from deltas_nets.network.lite.detector import (
     CELL,
     Keypoints,
     choose_keypoints,

@@ -13,11 +13,11 @@ from PIL import Image
 from run_command import Run, assert_one_line
 
 from deltas_nets import cli
-from deltas_nets.cli_training import Train
+from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS, DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.outputs import read_depth_png, read_points_ply
-from deltas_nets.pretrained import save_weights
+from deltas_nets.outputs.products import read_depth_png, read_points_ply
+from deltas_nets.weights_file import save_weights
 
 MakeCapture = Callable[..., Path]
 

@@ -17,7 +17,7 @@ from deltas_nets.config import (
     to_dict,
     without_paths,
 )
-from deltas_nets.data.scannet_config import ScanNetConfig
+from deltas_nets.config.scannet import ScanNetConfig
 
 FRAMES = DataConfig(
     source="scannet",

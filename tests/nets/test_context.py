@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_nets.network.context import Context, _Round
+from deltas_nets.network.joint.context import Context, _Round
 
 SAMPLES = 16
 

@@ -9,13 +9,13 @@ from hypothesis.extra import numpy as arrays
 from torch import Tensor
 
 from deltas_geom import ShapeError, SparseDepth
-from deltas_nets.network.convex_upsampling import (
+from deltas_nets.network.lite.convex_upsampling import (
     ConvexUpsampling,
     bilinear_logits,
     convex_upsample,
 )
-from deltas_nets.network.densifier import Densifier
-from deltas_nets.network.encoder import Encoder
+from deltas_nets.network.lite.densifier import Densifier
+from deltas_nets.network.lite.encoder import Encoder
 
 WIDTHS = (8, 8, 8, 8)
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from deltas_geom import PosedViews
 from deltas_nets.config import CONFIGS, NetworkConfig
-from deltas_nets.data.synthetic import render_room
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.descriptor import WIDTH, Descriptor
-from deltas_nets.network.encoder import Encoder
-from deltas_nets.pretrained import load_weights, weights_file
+from deltas_nets.network.lite.descriptor import WIDTH, Descriptor
+from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.rooms import render_room
+from deltas_nets.weights_file import load_weights, weights_file
 
 STRIDES = (2, 4)
 Stride = Literal[2, 4]

@@ -18,21 +18,21 @@ from stand_in_device import DEVICE, on_device, one_device
 from torch import Tensor, nn
 
 from deltas_nets.config import CONFIGS
-from deltas_nets.errors import UserError
-from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import load_model, read_metadata, save_weights, weights_file
-from deltas_nets.teachers import LICENCES, TEACHERS
-from deltas_nets.teachers.superpoint import SuperPoint
-from deltas_nets.train import distill as distill_module
-from deltas_nets.train import distill_pictures
-from deltas_nets.train.distill import (
+from deltas_nets.distill.lessons import prepare
+from deltas_nets.distill.superpoint import SuperPoint
+from deltas_nets.distill.teachers import LICENCES, TEACHERS
+from deltas_nets.distill.training import (
     DistillConfig,
     Learned,
     distill,
     record_of,
     train_detector,
 )
-from deltas_nets.train.lessons import prepare
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.train import distill as distill_module
+from deltas_nets.train import distill_pictures
+from deltas_nets.weights_file import load_model, read_metadata, save_weights, weights_file
 
 STEPS, PICTURES, LOOKS, ADAPTATION = 3, 2, 2, 2
 

@@ -24,11 +24,11 @@ from run_fit import (
 from torch import Tensor, nn
 
 from deltas_nets.config import CONFIGS, MatcherConfig, NetworkConfig, TrainConfig
-from deltas_nets.counts import Counts, CountsOverProcesses, CountsToCome, KnownCounts
-from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
-from deltas_nets.losses import masked_mean
+from deltas_nets.losses.divisors import Counts, CountsOverProcesses, CountsToCome, KnownCounts
+from deltas_nets.losses.losses import masked_mean
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batch_norm import Statistics, prepare_batch_norm
 from deltas_nets.train.batches import BatchMaker

@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.capture import Frame
+from deltas_nets.captures.work_size import load_image, load_views
 from deltas_nets.config import CONFIGS, DetectorConfig
-from deltas_nets.data.capture import Frame
-from deltas_nets.data.sample import load_image, load_views
-from deltas_nets.encoded_frames import EncodedFrames
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.encoded import Encoded
-from deltas_nets.predict import PredictConfig, predict_frame
+from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.encoded_frames import EncodedFrames
+from deltas_nets.predict.ours import predict_frame
 
 SIZE = (48, 64)
 

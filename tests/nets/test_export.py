@@ -24,7 +24,7 @@ from deltas_nets.export.formats import (
 )
 from deltas_nets.export.graph import FixedDeltas, trace
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import load_model
+from deltas_nets.weights_file import load_model
 
 
 class Exported(NamedTuple):

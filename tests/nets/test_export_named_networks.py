@@ -15,7 +15,7 @@ from deltas_nets.export.agreement import TOLERANCE, same_points
 from deltas_nets.export.formats import onnx_runner, program_runner
 from deltas_nets.export.graph import FixedDeltas
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.pretrained import load_model
+from deltas_nets.weights_file import load_model
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 from run_command import Run
 
 from deltas_nets import predict
-from deltas_nets.outputs import OutputFolder, prepare_output
+from deltas_nets.outputs.folder import OutputFolder, prepare_output
 
 SETTINGS: dict[str, Any] = {"views": 3}
 MakeCapture = Callable[..., Path]

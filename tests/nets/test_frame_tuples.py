@@ -11,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_scannet import SCANNET, SIZE, opened, overwrite, view_sets, written_list
 
-from deltas_nets.data.capture import FloatArray, open_capture
-from deltas_nets.data.frame_tuples import ByBaseline, ByGap
-from deltas_nets.data.scannet_config import ScanNetConfig
-from deltas_nets.data.scannet_scenes import LeftOut, Scene
-from deltas_nets.data.view_sets import ViewSet
+from deltas_nets.captures.capture import FloatArray
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.config.scannet import ScanNetConfig
+from deltas_nets.datasets.scenes import LeftOut, Scene
+from deltas_nets.datasets.tuple_rules import ByBaseline, ByGap
 from deltas_nets.errors import UserError
 
 

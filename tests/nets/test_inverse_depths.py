@@ -10,14 +10,15 @@ from torch import Tensor
 
 from deltas_geom import PosedViews
 from deltas_nets.config import MatcherConfig
-from deltas_nets.network.descriptor import Descriptors
-from deltas_nets.network.inverse_depths import (
+from deltas_nets.network.joint.inverse_depths import (
     best_of_bins,
     bin_centres,
     samples_per_bin,
     subdivide,
 )
-from deltas_nets.network.matcher import JointMatcher, Matched
+from deltas_nets.network.joint.matcher import JointMatcher
+from deltas_nets.network.lite.descriptor import Descriptors
+from deltas_nets.network.records import Matched
 
 SIZE = (48, 64)
 RANGE = (0.5, 10.0)

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from deltas_geom import Matches, PosedViews, Triangulation, triangulate
 from deltas_nets.config import CONFIGS, DetectorConfig, NetworkConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import render_room
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.judge import Judge, of_posterior, of_refinement, of_triangulation
-from deltas_nets.network.matcher import Decision, Matched, Posterior
+from deltas_nets.network.joint.judge import Judge, of_posterior, of_refinement, of_triangulation
+from deltas_nets.network.records import Decision, Matched, Posterior
+from deltas_nets.rooms import render_room
 
 SIZE = (64, 96)
 

@@ -11,9 +11,8 @@ from torch.nn.functional import binary_cross_entropy
 
 from deltas_geom import Matches, PosedViews, triangulate
 from deltas_nets.config import DetectorConfig, LossConfig, MatcherConfig, NetworkConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import render_room
-from deltas_nets.losses import (
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.losses.losses import (
     confidence_loss,
     depth_terms,
     match_loss,
@@ -23,10 +22,11 @@ from deltas_nets.losses import (
     spread_loss,
     training_losses,
 )
+from deltas_nets.losses.targets import Targets, keypoint_targets
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.densifier import DenseDepth
-from deltas_nets.network.matcher import Posterior
-from deltas_nets.targets import Targets, keypoint_targets
+from deltas_nets.network.lite.densifier import DenseDepth
+from deltas_nets.network.records import Posterior
+from deltas_nets.rooms import render_room
 
 RANGE = (0.5, 10.0)
 

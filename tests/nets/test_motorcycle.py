@@ -8,8 +8,8 @@ import skimage.data
 import torch
 
 from deltas_geom import PosedViews, pixel_grid, project, unproject
-from deltas_nets.data.motorcycle import SIZE, StereoPair, motorcycle
-from deltas_nets.data.synthetic.textures import PICTURES
+from deltas_nets.captures.motorcycle import SIZE, StereoPair, motorcycle
+from deltas_nets.rooms.textures import PICTURES
 
 
 @pytest.fixture(scope="module")

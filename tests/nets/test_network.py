@@ -8,13 +8,13 @@ from torch import Tensor
 
 from deltas_geom import PosedViews, ShapeError, SparseDepth, Status
 from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import render_room
-from deltas_nets.network.context import Context
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.network.deltas import Deltas, DepthPrediction
-from deltas_nets.network.densifier import interpolate_sparse
-from deltas_nets.network.detector import detector_heatmap, spread_points
-from deltas_nets.network.encoder import Encoder
+from deltas_nets.network.joint.context import Context
+from deltas_nets.network.lite.densifier import interpolate_sparse
+from deltas_nets.network.lite.detector import detector_heatmap, spread_points
+from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.rooms import render_room
 
 SIZE = (64, 96)
 

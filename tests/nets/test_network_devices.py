@@ -12,14 +12,14 @@ from torch import Tensor, nn
 
 from deltas_geom import PosedViews
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
-from deltas_nets.data.augment import Photometry
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.losses import training_losses
+from deltas_nets.datasets.augment import Photometry
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.distill.labels import hard_labels
+from deltas_nets.distill.superpoint import SuperPoint
+from deltas_nets.distill.supervision import TeacherLabels
+from deltas_nets.losses.losses import training_losses
+from deltas_nets.losses.targets import detector_labels, keypoint_targets
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.targets import detector_labels, keypoint_targets
-from deltas_nets.teachers.labels import hard_labels
-from deltas_nets.teachers.superpoint import SuperPoint
-from deltas_nets.teachers.supervision import TeacherLabels
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batch_norm import Statistics
 from deltas_nets.train.batches import Batch, BatchMaker

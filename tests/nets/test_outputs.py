@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from deltas_nets.errors import UserError
-from deltas_nets.outputs import (
-    OutputFolder,
-    prepare_output,
+from deltas_nets.outputs.atomic_files import write_json
+from deltas_nets.outputs.folder import OutputFolder, prepare_output
+from deltas_nets.outputs.products import (
     read_depth_png,
     read_points_ply,
     write_confidence_png,
     write_depth_png,
-    write_json,
     write_points_ply,
 )
 

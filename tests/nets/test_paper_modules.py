@@ -9,18 +9,18 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.flop_counter import FlopCounterMode
 
-from deltas_nets.network.dense_pyramid import DensePyramid
-from deltas_nets.network.resnet import ResNet50
-from deltas_nets.network.sparse_densifier import SparseDensifier, join_taps
-from deltas_nets.network.superpoint_head import DescriptorHead, DetectorHead
-from deltas_nets.network.taps import Backbone, Taps, imagenet_normalised
-from deltas_nets.network.up_projection import (
+from deltas_nets.network.paper.dense_pyramid import DensePyramid
+from deltas_nets.network.paper.resnet import ResNet50
+from deltas_nets.network.paper.sparse_densifier import SparseDensifier, join_taps
+from deltas_nets.network.paper.superpoint_head import DescriptorHead, DetectorHead
+from deltas_nets.network.paper.taps import Backbone, Taps, imagenet_normalised
+from deltas_nets.network.paper.up_projection import (
     SkiplessUpProjection,
     UpProjection,
     enlarge_by_both_axes,
     insert_zeros,
 )
-from deltas_nets.network.vgg import VGG9
+from deltas_nets.network.paper.vgg import VGG9
 
 SIZES = st.tuples(st.integers(8, 70), st.integers(8, 70))
 MAKERS: dict[str, type[ResNet50] | type[VGG9]] = {"resnet50": ResNet50, "vgg9": VGG9}

@@ -9,7 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from deltas_geom import PosedViews
 from deltas_nets.config import CONFIGS, PAPER_LOSS, MatcherConfig, NetworkConfig, from_dict, to_dict
-from deltas_nets.losses import training_losses
+from deltas_nets.losses.losses import training_losses
 from deltas_nets.network.deltas import Deltas
 
 PAPER = ["deltas-vgg9", "deltas-resnet50"]

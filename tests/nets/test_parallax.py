@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews, Triangulation, project, triangulate
-from deltas_nets.network.parallax import parallax_of, relative_error_per_pixel
+from deltas_nets.network.joint.parallax import parallax_of, relative_error_per_pixel
 
 FOCAL = 300.0
 

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from deltas_geom import Samples, correlate
 from deltas_geom.testing.strategies import image_pixels, vectors
 from deltas_nets.cost.operations import OperationCounter
-from deltas_nets.network.per_view_matcher import read_and_multiply
+from deltas_nets.network.paper.per_view_matcher import read_and_multiply
 
 SIZE = (24, 32)  # of the image, px; the map has stride 4
 CELLS = (6, 8)

@@ -11,8 +11,8 @@ from deltas_nets import load_model
 from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.encoder import Encoder
-from deltas_nets.pretrained import (
+from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.weights_file import (
     load_weights,
     read_metadata,
     save_weights,

@@ -13,10 +13,10 @@ from torch.testing import assert_close
 from deltas_geom.checks import ShapeError
 from deltas_nets import reference
 from deltas_nets.errors import UserError
-from deltas_nets.pretrained import weights_file
 from deltas_nets.reference import ReferenceNetwork
 from deltas_nets.reference.checkpoint import ENTRIES
 from deltas_nets.reference.differences import DIFFERENCES, page
+from deltas_nets.weights_file import weights_file
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,15 @@ from run_command import Run, assert_one_line
 from torch.testing import assert_close
 
 from deltas_geom.testing.scenes import rigid
-from deltas_nets import published, reference
-from deltas_nets.any_network import load_network
-from deltas_nets.data.capture import Capture, Frame, open_capture
+from deltas_nets import reference
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.opening import open_capture
 from deltas_nets.errors import UserError
-from deltas_nets.outputs import read_depth_png, read_points_ply
-from deltas_nets.pretrained import weights_file
+from deltas_nets.outputs.products import read_depth_png, read_points_ply
+from deltas_nets.predict import reference as published
+from deltas_nets.predict.predictor import load_network
 from deltas_nets.reference import ReferenceNetwork
+from deltas_nets.weights_file import weights_file
 
 MakeCapture = Callable[..., Path]
 SMALL = ("--work-size", 48, 64, "--views", 2)

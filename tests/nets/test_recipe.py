@@ -16,14 +16,14 @@ from torch import Tensor
 
 from deltas_nets.config import to_dict
 from deltas_nets.config.recipes import FEWEST_ROOMS, RECIPES, Part, Recipe
-from deltas_nets.data.synthetic import Rooms
 from deltas_nets.errors import UserError
-from deltas_nets.pretrained import load_model, read_metadata, weights_file
+from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train import recipe as recipe_module
 from deltas_nets.train.checkpoint import load_config
 from deltas_nets.train.recipe import RECORD, Beginning, begin, run_parts
 from deltas_nets.train.start import Start
+from deltas_nets.weights_file import load_model, read_metadata, weights_file
 
 CONFIG = replace(CONFIG_OF_FOUR, batch_size=2)
 SMALL = Recipe(

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom.checks import ShapeError
-from deltas_nets.network.up_projection import insert_zeros
+from deltas_nets.network.paper.up_projection import insert_zeros
 from deltas_nets.reference import fill_keypoints, metric_result, pick_keypoints
 from deltas_nets.reference.metrics import mean_result
 from deltas_nets.reference.network import enlarge_by_rows

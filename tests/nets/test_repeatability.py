@@ -13,13 +13,13 @@ from torch.testing import assert_close
 
 from deltas_geom import PosedViews
 from deltas_geom.checks import ShapeError
-from deltas_nets.data.synthetic import render_room
 from deltas_nets.evaluate.repeatability import (
     Repeatability,
     pooled,
     repeatability,
     strongest_points,
 )
+from deltas_nets.rooms import render_room
 
 SIZE = (60, 80)
 FOCAL, DEPTH = 50.0, 2.0

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from run_fit import CONFIG
 
-from deltas_nets.atomic_files import write_json
 from deltas_nets.config import TRAIN_CONFIGS, MatcherConfig, TrainConfig, to_dict
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.train.resume import OF_THE_MACHINE, check_continues, resumed_config
 
 USUAL = TRAIN_CONFIGS["deltas-small"]

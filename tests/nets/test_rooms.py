@@ -12,14 +12,14 @@ from torch.utils.data import DataLoader, default_collate
 
 from deltas_geom.cameras.projection import project, unproject
 from deltas_geom.cameras.views import PosedViews
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import Rooms, draw_room, render_room, texture_atlas
-from deltas_nets.data.synthetic.cast import cast_rays
-from deltas_nets.data.synthetic.furniture import BOX, CYLINDER, ELLIPSOID
-from deltas_nets.data.synthetic.materials import Surfaces
-from deltas_nets.data.synthetic.render import _mirror_image, render_view
-from deltas_nets.data.synthetic.scene import Room, Solids
-from deltas_nets.data.synthetic.textures import (
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.rooms import Rooms, draw_room, render_room, texture_atlas
+from deltas_nets.rooms.cast import cast_rays
+from deltas_nets.rooms.furniture import BOX, CYLINDER, ELLIPSOID
+from deltas_nets.rooms.materials import Surfaces
+from deltas_nets.rooms.render import _mirror_image, render_view
+from deltas_nets.rooms.scene import Room, Solids
+from deltas_nets.rooms.textures import (
     GROUNDS,
     LEVEL_SIZES,
     PICTURES,

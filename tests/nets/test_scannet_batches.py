@@ -10,12 +10,12 @@ from PIL import Image
 from small_scannet import SCANNET, SIZE, agreeing_share, opened, overwrite, tiny, view_sets
 
 from deltas_geom import PosedViews
-from deltas_nets.data.capture import open_capture
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.sample import depth_at_image, load_views
-from deltas_nets.data.scannet_config import ScanNetConfig
-from deltas_nets.data.scannet_tuples import ScanNetTuples
-from deltas_nets.data.view_sets import ViewSet
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.work_size import depth_at_image, load_views
+from deltas_nets.config.scannet import ScanNetConfig
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.datasets.tuples import ScanNetTuples
 from deltas_nets.errors import UserError
 from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.data_sets import validation_data

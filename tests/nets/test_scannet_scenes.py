@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from small_scannet import overwrite, written_list
 
-from deltas_nets.data import scannet_scenes
-from deltas_nets.data.capture import open_capture
-from deltas_nets.data.scannet_cache import read_scene_cached
-from deltas_nets.data.scannet_scenes import LeftOut, read_scene
-from deltas_nets.data.scene_names import choose_scenes, find_scenes
-from deltas_nets.data.skip_list import SkipList, read_skip_list
+from deltas_nets.captures import scannet_scenes
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.datasets.scene_cache import read_scene_cached
+from deltas_nets.datasets.scene_names import choose_scenes, find_scenes
+from deltas_nets.datasets.scenes import LeftOut, read_scene
+from deltas_nets.datasets.skip_list import SkipList, read_skip_list
 from deltas_nets.errors import UserError
 
 

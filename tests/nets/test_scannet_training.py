@@ -11,11 +11,11 @@ from run_fit import assert_same_state, logged
 from small_scannet import tiny, written_list
 
 from deltas_nets import cli
-from deltas_nets.cli_training import Train
+from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS
-from deltas_nets.data.scannet_config import ScanNetConfig
-from deltas_nets.pretrained import read_metadata
+from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.train.fit import Start, fit
+from deltas_nets.weights_file import read_metadata
 
 
 def test_a_resumed_run_equals_an_unbroken_one(scannet_root: Path, tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deltas_geom import PosedViews, epipolar_distance, fundamental_between
-from deltas_nets.data.synthetic import render_room
-from deltas_nets.targets import detector_labels, keypoint_targets, read_nearest
+from deltas_nets.losses.targets import detector_labels, keypoint_targets, read_nearest
+from deltas_nets.rooms import render_room
 
 K = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
 

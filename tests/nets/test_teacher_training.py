@@ -15,21 +15,21 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from deltas_nets.config import CONFIGS, TrainConfig
+from deltas_nets.distill.labels import hard_labels, soft_labels
+from deltas_nets.distill.superpoint import SuperPoint, load_superpoint
+from deltas_nets.distill.supervision import TeacherLabels
+from deltas_nets.distill.teachers import load_teacher, superpoint
 from deltas_nets.errors import UserError
-from deltas_nets.losses import detector_loss, training_losses
+from deltas_nets.losses.losses import detector_loss, training_losses
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.detector import detector_heatmap
-from deltas_nets.pretrained import read_metadata
-from deltas_nets.teachers import load_teacher, superpoint
-from deltas_nets.teachers.labels import hard_labels, soft_labels
-from deltas_nets.teachers.superpoint import SuperPoint, load_superpoint
-from deltas_nets.teachers.supervision import TeacherLabels
+from deltas_nets.network.lite.detector import detector_heatmap
 from deltas_nets.train import start as start_module
 from deltas_nets.train import step as step_module
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start
 from deltas_nets.train.loader import room_loader
 from deltas_nets.train.step import Objective
+from deltas_nets.weights_file import read_metadata
 
 TAUGHT = replace(CONFIG, steps=2, teacher="superpoint")
 ODD = (52, 68)  # rows and columns beyond the last whole cell
@@ -136,7 +136,8 @@ def test_labels_are_the_teachers_of_the_anchors_in_their_own_light(
     train(tmp_path / "run", config, Start(teacher=files[layout]), stop=1)
     with monkeypatch.context() as patch:
         patch.setattr(
-            "deltas_nets.data.augment.Photometry.forward", lambda _, images, seed, **place: images
+            "deltas_nets.datasets.augment.Photometry.forward",
+            lambda _, images, seed, **place: images,
         )
         anchors = first_batch(config).images[:, 0]
     teacher = load_superpoint(files[layout])

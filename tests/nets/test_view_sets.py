@@ -10,9 +10,10 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from deltas_nets.data.capture import Capture, Frame, open_capture
-from deltas_nets.data.view_choice import choose_view_sets
-from deltas_nets.data.view_sets import ViewSet, check_frames, read_view_sets
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]

@@ -6,10 +6,10 @@ import time
 
 import torch
 
-from deltas_nets.data.posed_images import PosedImages
-from deltas_nets.data.workers import rendered_ahead
+from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.datasets.workers import rendered_ahead
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
-from deltas_nets.pretrained import load_model
+from deltas_nets.weights_file import load_model
 
 SIZE = (48, 64)
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from deltas_nets.data.capture import Capture, open_capture
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 MakeCapture = Callable[..., Path]

@@ -1,0 +1,1 @@
+"""Captures: posed images as people have them, and which of them go together."""

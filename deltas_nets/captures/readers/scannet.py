@@ -1,0 +1,268 @@
+"""ScanNet's export layout: color/N.jpg, depth/N.png, pose/N.txt, intrinsic/*.txt."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture, FloatArray, Frame, ids_in_words, image_size_of
+from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrinsics
+from deltas_nets.captures.text_lines import read_numbers
+from deltas_nets.errors import UserError
+
+__all__ = [
+    "NESTING",
+    "SceneFiles",
+    "find_files",
+    "is_scene",
+    "read",
+    "read_pose",
+    "recognises",
+    "world_from_cam_inverse",
+]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+NESTING = ("scans_test", "scans")
+"""Folders that scenes may lie in, inside of the one that is named."""
+
+RIGID_TOLERANCE = 2e-3
+"""Largest entry of R^T R - I. Six digits after the point give 1e-5, 7-Scenes as published
+1.5e-4; a scale of 0.1 %, the least that would matter to metric depth, gives 2e-3."""
+
+_NO_POSE = "repair it or take the frame out of the view sets"
+
+
+class SceneFiles(NamedTuple):
+    """What the folder of one scene holds; poses are not read yet.
+
+    Attributes:
+        images: colour images by frame number, in order.
+        poses: pose files by frame number.
+        depths: depth images by frame number; empty where there is no such folder.
+        image_size: (height, width) of the colour images.
+        K: ``(3, 3)`` of the colour images.
+        depth_K: ``(3, 3)`` of the depth images; None where they see what the images see.
+        depth_size: (height, width) of the depth images; None if there are none that decode.
+        doubts: what may be a mistake, each for a warning.
+    """
+
+    images: Mapping[int, Path]
+    poses: Mapping[int, Path]
+    depths: Mapping[int, Path]
+    image_size: tuple[int, int]
+    K: FloatArray
+    depth_K: FloatArray | None
+    depth_size: tuple[int, int] | None
+    doubts: tuple[str, ...]
+
+
+def recognises(path: Path) -> bool:
+    """Whether this folder, or a folder of scenes inside it, is laid out this way."""
+    nested = any((path / name).is_dir() for name in NESTING)
+    return nested or is_scene(path) or any(map(is_scene, path.iterdir()))
+
+
+def read(path: Path) -> Capture:
+    """Read one scene; see `deltas_nets.captures.capture.open_capture` for the contract."""
+    scene = _find_scene(path)
+    files = find_files(scene)
+    frames: dict[int, Frame] = {}
+    lost: dict[int, UserError] = {}
+    for id, image_path in files.images.items():
+        if id not in files.poses:
+            file = scene / "pose" / f"{id}.txt"
+            lost[id] = UserError(f"frame {id} has no pose file", file, _NO_POSE)
+            continue
+        pose = files.poses[id]
+        world_from_cam = read_pose(pose)
+        if not np.isfinite(world_from_cam).all():
+            lost[id] = UserError(f"the pose of frame {id} is not finite", pose, _NO_POSE)
+            continue
+        depth_path = files.depths.get(id)
+        frames[id] = Frame(
+            id=id,
+            image_path=image_path,
+            image_size=files.image_size,
+            K=files.K,
+            cam_from_world=world_from_cam_inverse(world_from_cam, path=pose),
+            depth_path=depth_path,
+            depth_K=None if depth_path is None else files.depth_K,
+            depth_size=None if depth_path is None else files.depth_size,
+        )
+    if not frames:
+        what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(lost)})"
+        raise UserError(what, scene / "pose", "run the tracking again")
+    return Capture(path=scene, frames=frames, lost=lost, doubts=files.doubts)
+
+
+def find_files(scene: Path) -> SceneFiles:
+    """The files of a scene by frame number, and its intrinsics.
+
+    Args:
+        scene: the folder that holds color, pose and intrinsic.
+
+    Raises:
+        UserError: a folder or the images are missing, no pose belongs to an image, or the
+            intrinsics are missing or do not fit the images.
+    """
+    remedies = {
+        "color": "put the images there: color/0.jpg, color/1.jpg, ...",
+        "pose": "put a 4x4 camera-to-world matrix there for each image: pose/0.txt, ...",
+    }
+    for name, remedy in remedies.items():
+        if not (scene / name).is_dir():
+            raise UserError(f"the capture has no folder {name}", scene, remedy)
+    images = _files_by_id(scene / "color", IMAGE_SUFFIXES)
+    poses = _files_by_id(scene / "pose", (".txt",))
+    depths = _files_by_id(scene / "depth", (".png",)) if (scene / "depth").is_dir() else {}
+    if not images:
+        remedy = "put the images there, named by number: 0.jpg, 1.jpg, ..."
+        raise UserError("there are no numbered images", scene / "color", remedy)
+    if not images.keys() & poses.keys():
+        what = f"no pose belongs to an image ({len(poses)} poses, {len(images)} images)"
+        remedy = "name each pose file like its image: pose/7.txt for color/7.jpg"
+        raise UserError(what, scene / "pose", remedy)
+
+    image_size = _common_size(images.values())
+    if image_size is None:
+        what = f"none of the {len(images)} images can be decoded"
+        raise UserError(what, next(iter(images.values())), "copy the files again")
+    file = scene / "intrinsic" / "intrinsic_color.txt"
+    K = read_intrinsics(file, image_size)
+    doubts = [_misnamed(scene / "color"), doubtful_centre(K, image_size, file)]
+    depth_size = _common_size(depths.values())
+    depth_K = None
+    depth_file = scene / "intrinsic" / "intrinsic_depth.txt"
+    # Registered depth often comes without a file of its own: None says "as the colour image".
+    if depths and depth_file.exists():
+        depth_K = read_intrinsics(depth_file, depth_size)
+    elif depth_size is not None:
+        doubts.append(_other_shape(depth_size, image_size, depth_file))
+    said = tuple(doubt for doubt in doubts if doubt is not None)
+    return SceneFiles(images, poses, depths, image_size, K, depth_K, depth_size, said)
+
+
+def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
+    """The rigid inverse of a finite pose, rounded by printing as it may be.
+
+    Args:
+        world_from_cam: ``(4, 4)``.
+        path: the file it came from, for the error.
+
+    Returns:
+        ``(4, 4)`` whose rotation is orthogonal to float64 precision.
+
+    Raises:
+        UserError: the matrix is not a rotation and a translation.
+    """
+    rotation, centre = world_from_cam[:3, :3], world_from_cam[:3, 3]
+    remedy = "write poses as rigid 4x4 camera-to-world matrices, last row 0 0 0 1"
+    if not np.allclose(world_from_cam[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
+        row = " ".join(f"{value:g}" for value in world_from_cam[3])
+        raise UserError(f"the pose's last row is {row}, not 0 0 0 1", path, remedy)
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not error <= RIGID_TOLERANCE:
+        what = f"the pose is not rigid: its rotation is off orthogonal by {error:.2g}"
+        raise UserError(what, path, remedy)
+    if np.linalg.det(rotation) < 0:
+        raise UserError("the pose mirrors: its rotation has determinant -1", path, remedy)
+    # The nearest rotation, else R^T is not the inverse of R and the rounding of the file stays.
+    left, _, right = np.linalg.svd(rotation)
+    nearest = left @ right
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = nearest.T
+    cam_from_world[:3, 3] = -nearest.T @ centre
+    cam_from_world.setflags(write=False)
+    return cam_from_world
+
+
+def is_scene(path: Path) -> bool:
+    """Whether the folder itself holds a scene, or the beginning of one."""
+    return any((path / name).is_dir() for name in ("color", "pose", "intrinsic"))
+
+
+def _find_scene(path: Path) -> Path:
+    """The folder that holds a scene: this one, or the only one inside."""
+    scene = path
+    if not is_scene(path):
+        nests = [path, *(path / name for name in NESTING if (path / name).is_dir())]
+        scenes = sorted(child for nest in nests for child in nest.iterdir() if is_scene(child))
+        if not scenes:
+            remedy = "put the folders color, pose and intrinsic into a folder of it"
+            raise UserError("there is no scene inside", nests[-1], remedy)
+        if len(scenes) > 1:
+            names = ", ".join(str(scene.relative_to(path)) for scene in scenes[:5])
+            more = f" and {len(scenes) - 5} more" if len(scenes) > 5 else ""
+            what = f"the folder holds {len(scenes)} scenes ({names}{more})"
+            raise UserError(what, path, "name one of them")
+        scene = scenes[0]
+    return scene
+
+
+def _files_by_id(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """Files named by a number, in the order of the numbers."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in suffixes or not _is_number(path.stem):
+            continue
+        id = int(path.stem)
+        if id in found:
+            what = f"two files stand for frame {id} ({found[id].name} and {path.name})"
+            raise UserError(what, folder, "remove one of them")
+        found[id] = path
+    return dict(sorted(found.items()))
+
+
+def _is_number(name: str) -> bool:
+    return name.isascii() and name.isdigit()
+
+
+def _misnamed(folder: Path) -> str | None:
+    """A warning that names a file with the number or the suffix of an image, but not both."""
+    found = sorted(
+        path.name
+        for path in folder.iterdir()
+        if (path.suffix.lower() in IMAGE_SUFFIXES) != _is_number(path.stem)
+        and not path.name.startswith(".")
+    )
+    if not found:
+        return None
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return f"left out, {folder / found[0]}{more}: images are N.jpg or N.png, N a number"
+
+
+def _other_shape(
+    depth_size: tuple[int, int], image_size: tuple[int, int], missing: Path
+) -> str | None:
+    """A warning where depth cannot show what the images show: one of them is turned or cropped."""
+    (rows, columns), (height, width) = depth_size, image_size
+    if 0.95 < rows * width / (height * columns) < 1.05:
+        return None
+    return (
+        f"depth of {columns}x{rows} is taken to show what images of {width}x{height} show, for "
+        f"there is no {missing}"
+    )
+
+
+def _common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
+    """Size of the first readable image: one intrinsic file serves all, so they have one size.
+
+    Only one header is read: 2000 would take seconds on a network drive, and reading an image
+    checks its size against this one. A damaged first file is no obstacle while nobody needs it.
+    """
+    sizes = (image_size_of(path) for path in paths)
+    return next((size for size in sizes if size is not None), None)
+
+
+def read_pose(path: Path) -> FloatArray:
+    """(4, 4) world_from_cam, not finite where tracking was lost.
+
+    Raises:
+        UserError: the file does not hold 16 numbers.
+    """
+    remedy = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
+    numbers = read_numbers(path, name="pose", remedy=remedy)
+    if len(numbers) != 16:
+        raise UserError(f"the pose file has {len(numbers)} numbers, not 16", path, remedy)
+    return np.array(numbers, dtype=np.float64).reshape(4, 4)

@@ -1,0 +1,193 @@
+"""Which frames are looked at together, chosen by geometry where no file says it."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deltas_nets.captures.capture import Capture, FloatArray, ids_in_words
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.errors import UserError
+
+__all__ = ["choose_view_sets", "spread_sources"]
+
+PROBE_DEPTHS = (0.4, 0.8, 1.6)
+"""Where surfaces may be, in working depths: overlap is the mean over these."""
+PROBES_ACROSS = 8  # columns and rows of anchor pixels probed
+
+GOOD_BASELINES = (0.06, 0.10)
+"""In working depths. Below, half a pixel of matching error is too much depth; above, patches
+look different and overlap shrinks. The score falls off on both sides."""
+MAX_BASELINE = 0.25  # in working depths; beyond, a frame is not even scored
+MIN_BASELINE = 0.01
+MIN_OVERLAP = 0.4
+MAX_ANGLE = np.radians(45)
+GOOD_ANGLE = np.radians(15)  # where the penalty of the viewing angle reaches exp(-1/2)
+MAX_CANDIDATES = 48  # frames scored by projection for each anchor
+
+
+def choose_view_sets(
+    capture: Capture,
+    num_views: int,
+    *,
+    working_depth: float = 2.5,
+    anchors: Iterable[int] | None = None,
+) -> tuple[ViewSet, ...]:
+    """Choose sources for every frame by baseline, viewing angle and overlap.
+
+    A frame without an acceptable source gets the best there are; otherwise only acceptable
+    sources are chosen, so a set may have fewer than ``num_views - 1``.
+
+    Args:
+        capture: two frames or more.
+        num_views: the anchor and at most ``num_views - 1`` sources.
+        working_depth: metres to typical surfaces; good baselines are 6 to 10 % of it.
+        anchors: frames that want a set; all by default.
+
+    Raises:
+        UserError: the capture has one frame only, or an anchor that it does not have.
+    """
+    if num_views < 2:
+        what = f"{num_views} views are too few"
+        raise UserError(what, "--views", "use 2 or more: the anchor and a source")
+    if len(capture.frames) < 2:
+        what = f"the capture has one frame with a usable pose ({ids_in_words(capture.frames)})"
+        raise UserError(what, capture.path, "depth from views needs two frames or more")
+    ids = list(capture.frames)
+    index_of = {id: index for index, id in enumerate(ids)}
+    wanted = ids if anchors is None else list(anchors)
+    for id in wanted:
+        capture.frame(id)
+    poses = np.stack([capture.frames[id].cam_from_world for id in ids])
+    centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+
+    view_sets = []
+    for id in wanted:
+        anchor = index_of[id]
+        near = _candidates(centres, poses[:, 2, :3], anchor, working_depth)
+        overlap = _overlap(capture, ids, poses, anchor, near, working_depth)
+        offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
+        angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
+        log_score, acceptable = _rate(offsets, angles, overlap, working_depth)
+        if acceptable.any():
+            near, offsets = near[acceptable], offsets[acceptable]
+            log_score = log_score[acceptable]
+        chosen = spread_sources(log_score, offsets, num_views - 1)
+        view_sets.append(ViewSet(id, tuple(ids[near[index]] for index in chosen)))
+    return tuple(view_sets)
+
+
+def _candidates(
+    centres: FloatArray, axes: FloatArray, anchor: int, working_depth: float
+) -> NDArray[np.intp]:
+    """Indices of the frames worth projecting into: near a good baseline, looking alike.
+
+    Everything is ranked, so that a frame far from all others still has candidates.
+    """
+    baseline = np.linalg.norm(centres - centres[anchor], axis=-1) / working_depth
+    angle = _angles(axes, axes[anchor])
+    cost = -_baseline_log_score(baseline) + 0.5 * (angle / GOOD_ANGLE) ** 2
+    # Behind all that are near enough, but ranked.
+    cost += np.where((baseline > MAX_BASELINE) | (angle > MAX_ANGLE), 1e6, 0.0)
+    cost[anchor] = np.inf
+    count = min(MAX_CANDIDATES, len(centres) - 1)
+    nearest = np.argpartition(cost, count - 1)[:count]
+    # In frame order: ties of the score then go to the earlier frame, whatever numpy does.
+    return np.sort(nearest)
+
+
+def _angles(axes: FloatArray, axis: FloatArray) -> FloatArray:
+    """Angles between viewing directions (third rows of cam_from_world), rad."""
+    angles: FloatArray = np.arccos(np.clip(axes @ axis, -1.0, 1.0))
+    return angles
+
+
+def _baseline_log_score(baseline: FloatArray) -> FloatArray:
+    """0 in the good range, falling with the square of the log-ratio to it.
+
+    The log makes half and double equally bad, as they are for parallax and for appearance.
+    """
+    low, high = GOOD_BASELINES
+    clipped = np.clip(baseline, low, high)
+    ratio: FloatArray = np.log(np.maximum(baseline, 1e-6) / clipped)
+    score: FloatArray = -0.5 * (ratio / np.log(2.0)) ** 2
+    return score
+
+
+def _overlap(
+    capture: Capture,
+    ids: Sequence[int],
+    poses: FloatArray,
+    anchor: int,
+    near: NDArray[np.intp],
+    working_depth: float,
+) -> FloatArray:
+    """Part of the anchor's image that each candidate sees, over the probed depths, (C,)."""
+    frame = capture.frames[ids[anchor]]
+    height, width = frame.image_size
+    parts = (np.arange(PROBES_ACROSS) + 0.5) / PROBES_ACROSS
+    x, y = np.meshgrid(parts * width - 0.5, parts * height - 0.5)
+    pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    rays = np.linalg.inv(frame.K) @ pixels
+    points = np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
+
+    rotation, shift = poses[anchor, :3, :3], poses[anchor, :3, 3:]
+    others = [capture.frames[ids[index]] for index in near]
+    # Relative poses first: with the world's origin kilometres away the sums would cancel.
+    turns = poses[near, :3, :3] @ rotation.T
+    seen = turns @ points + (poses[near, :3, 3:] - turns @ shift)
+    projected = np.stack([other.K for other in others]) @ seen
+    depth = projected[:, 2]
+    in_front = depth > 0.1
+    safe = np.where(in_front, depth, 1.0)
+    column, row = projected[:, 0] / safe, projected[:, 1] / safe
+    sizes = np.array([other.image_size for other in others], dtype=np.float64)
+    inside = (np.abs(column - (sizes[:, 1:] - 1) / 2) <= sizes[:, 1:] / 2) & (
+        np.abs(row - (sizes[:, :1] - 1) / 2) <= sizes[:, :1] / 2
+    )
+    part: FloatArray = (in_front & inside).mean(axis=-1)
+    return part
+
+
+def _rate(
+    offsets: FloatArray, angles: FloatArray, overlap: FloatArray, working_depth: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Log scores of candidates and whether they are acceptable; offsets in the anchor's axes."""
+    baseline = np.linalg.norm(offsets, axis=-1) / working_depth
+    # Parallax comes from moving sideways; moving along the view leaves its centre without any.
+    sideways = np.linalg.norm(offsets[:, :2], axis=-1) / working_depth
+    effective = np.sqrt(sideways**2 + 0.25 * (offsets[:, 2] / working_depth) ** 2)
+    score = _baseline_log_score(effective)
+    score = score - 0.5 * (angles / GOOD_ANGLE) ** 2 + 2.0 * np.log(np.maximum(overlap, 1e-3))
+    acceptable = (baseline >= MIN_BASELINE) & (baseline <= MAX_BASELINE)
+    acceptable &= (overlap >= MIN_OVERLAP) & (angles <= MAX_ANGLE)
+    return score, acceptable
+
+
+def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> list[int]:
+    """Greedily the best, each discounted by how nearly it repeats one that was chosen.
+
+    A second view from the same place adds little; one from the opposite side sees what the
+    first cannot, and its errors differ.
+
+    Args:
+        log_score: ``(C,)`` of the candidates, the more the better.
+        offsets: ``(C, 3)`` metres from the anchor.
+        count: how many are wanted.
+
+    Returns:
+        Indices of at most ``count`` candidates, best first.
+    """
+    lengths = np.linalg.norm(offsets, axis=-1, keepdims=True)
+    directions = offsets / np.maximum(lengths, 1e-9)
+    repeated = np.zeros(len(log_score))
+    left = log_score.copy()
+    chosen: list[int] = []
+    for _ in range(min(count, len(log_score))):
+        best = int(np.argmax(left - repeated))
+        chosen.append(best)
+        left[best] = -np.inf
+        gap = np.linalg.norm(offsets - offsets[best], axis=-1) / lengths[best].clip(1e-9)
+        alike = np.maximum(directions @ directions[best], 0.0) * np.exp(-gap)
+        repeated = np.maximum(repeated, 1.5 * alike)
+    return chosen

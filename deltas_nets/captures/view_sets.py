@@ -1,0 +1,154 @@
+"""Which frames are looked at together: read from a file, and checked."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture, ids_in_words
+from deltas_nets.errors import UserError
+
+__all__ = ["ViewSet", "check_frames", "doubtful_scale", "read_view_sets"]
+
+
+class ViewSet(NamedTuple):
+    """Ids of frames that are looked at together."""
+
+    anchor: int
+    """The frame whose depth is wanted."""
+    sources: tuple[int, ...]
+    """The frames that help, best first."""
+
+
+def read_view_sets(
+    path: str | Path, capture: Capture, *, allow_no_sources: bool = False
+) -> tuple[ViewSet, ...]:
+    """Read ``[{"anchor": 10, "sources": [8, 12]}, ...]``.
+
+    Args:
+        path: the JSON file.
+        capture: the frames that the ids name.
+        allow_no_sources: whether an anchor may stand alone, as it may with sensor depth.
+
+    Raises:
+        UserError: the file is missing, not JSON or of another form, or a set cannot be used.
+    """
+    path = Path(path)
+    form = 'write [{"anchor": 10, "sources": [8, 12]}, ...]'
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        what = f"the view sets cannot be read ({error.strerror})"
+        raise UserError(what, path, "check the path") from error
+    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON
+        raise UserError(f"the view sets are not JSON ({error})", path, form) from error
+    if not isinstance(entries, list):
+        raise UserError("the view sets are not a list", path, form)
+    if not entries:
+        raise UserError("the list of view sets is empty", path, form)
+
+    sets: dict[int, ViewSet] = {}
+    for position, entry in enumerate(entries):
+        name = f"view set {position + 1} of {len(entries)}"
+        if not isinstance(entry, dict) or not entry.keys() >= {"anchor", "sources"}:
+            raise UserError(f"{name} is not an object with anchor and sources", path, form)
+        anchor, sources = entry["anchor"], entry["sources"]
+        if not _is_id(anchor):
+            raise UserError(f"{name} has anchor {anchor!r}, not a frame number", path, form)
+        if not isinstance(sources, list) or not all(_is_id(source) for source in sources):
+            what = f"{name} (anchor {anchor}) has sources that are no list of frame numbers"
+            raise UserError(what, path, form)
+        _check_ids(name, anchor, sources, path=path, capture=capture)
+        if not sources and not allow_no_sources:
+            what = f"{name} (anchor {anchor}) has no sources"
+            raise UserError(what, path, "name one source or more, or use sensor depth")
+        if anchor in sets:
+            what = f"{name} has anchor {anchor}, which an earlier set has too"
+            raise UserError(what, path, "keep one of them: outputs are named by the anchor")
+        sets[anchor] = ViewSet(anchor, tuple(sources))
+    return tuple(sets.values())
+
+
+def check_frames(
+    capture: Capture,
+    view_sets: Sequence[ViewSet],
+    *,
+    with_depth: bool = False,
+    report: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Check every frame that a set names, before anything is computed or written.
+
+    Args:
+        capture: the frames.
+        view_sets: what will be used of them.
+        with_depth: whether the sensor depth of the anchors will be read too.
+        report: called with the id of every checked frame.
+
+    Raises:
+        UserError: a frame is missing, its pose is not finite, or its image or depth does not
+            decode to the end; the text names the file.
+    """
+    named = dict.fromkeys(id for view_set in view_sets for id in (view_set[0], *view_set[1]))
+    for id in named:
+        frame = capture.frame(id)
+        if not np.isfinite(frame.cam_from_world).all():
+            remedy = "take the frame out of the view sets"
+            raise UserError(f"the pose of frame {id} is not finite", frame.image_path, remedy)
+        frame.read_image()
+        report(str(id))
+    if with_depth:
+        for view_set in view_sets:
+            capture.frame(view_set.anchor).read_depth()
+
+
+def _is_id(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _check_ids(
+    name: str, anchor: int, sources: Sequence[int], *, path: Path, capture: Capture
+) -> None:
+    if anchor in sources:
+        what = f"{name} has its anchor {anchor} among its own sources"
+        raise UserError(what, path, "take it out of the sources")
+    if len(set(sources)) < len(sources):
+        what = f"{name} (anchor {anchor}) names a source twice"
+        raise UserError(what, path, "name each source once")
+    for id in (anchor, *sources):
+        if id in capture.lost:
+            raise capture.lost[id]
+        if id not in capture.frames:
+            nearest = sorted(capture.frames, key=lambda other: (abs(other - id), other))[:4]
+            what = f"{name} names frame {id}, which {capture.path} does not have"
+            remedy = f"use its frames; the nearest are {ids_in_words(sorted(nearest))}"
+            raise UserError(what, path, remedy)
+
+
+def doubtful_scale(
+    capture: Capture, view_sets: Sequence[ViewSet], depth_range: tuple[float, float]
+) -> str | None:
+    """Words for cameras that stand so near or far that their poses are hardly in metres.
+
+    Args:
+        capture: the frames.
+        view_sets: that are used.
+        depth_range: (near, far) of the search, metres.
+    """
+    used = {id for views in view_sets for id in (views.anchor, *views.sources)}
+    centres = {id: np.linalg.inv(capture.frame(id).cam_from_world)[:3, 3] for id in used}
+    baselines = [
+        float(np.linalg.norm(centres[source] - centres[views.anchor]))
+        for views in view_sets
+        for source in views.sources
+    ]
+    if not baselines:  # depth from a sensor, to be scored
+        return None
+    usual, (near, far) = float(np.median(baselines)), depth_range
+    if near / 250 <= usual <= far / 2:
+        return None
+    return (
+        f"views that go together stand {usual:.3g} m apart (median), and depth is searched from "
+        f"{near:g} to {far:g} m: are the poses in metres? If not, scale their translations"
+    )

@@ -1,0 +1,1 @@
+"""The commands of `deltas`, one file each; `cli.py` lists them."""

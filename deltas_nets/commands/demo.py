@@ -1,0 +1,34 @@
+"""The command `deltas demo`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from deltas_nets.commands.flags import Flag, Prediction
+from deltas_nets.errors import UserError
+
+
+@dataclass(frozen=True)
+class Demo(Prediction):
+    """Depth of a real stereo pair, with its errors: does everything work here?
+
+    Runs the shipped weights on the Middlebury motorcycle pair that scikit-image carries,
+    prints errors and times, and writes depth, confidence, points and a figure.
+
+    Example: deltas demo --out demo
+    """
+
+    out: Path = Path("deltas-demo")
+    """Folder to write to."""
+    overwrite: Flag = False
+    """Write into a folder that holds other things."""
+
+    def run(self) -> None:
+        """Do it."""
+        from deltas_nets.network.deltas import Deltas
+        from deltas_nets.predict.demo import run_demo
+
+        network = self.network()
+        if not isinstance(network, Deltas):
+            what = "the demo draws stages that the published network does not have"
+            raise UserError(what, self.weights, "use deltas depth")
+        run_demo(network, self.config(), self.out, self.weights, overwrite=self.overwrite)

@@ -1,0 +1,76 @@
+"""The command `deltas export`: the whole network as one file for other programs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deltas_nets.commands.flags import Flag
+from deltas_nets.errors import UserError
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the whole network as one file: .onnx for onnxruntime, .pt2 for torch.export.load.
+
+    Inputs are images (1, V, 3, H, W) in [0, 1], K (1, V, 3, 3) and cam_from_world (1, V, 4, 4);
+    outputs depth and std (1, 1, H, W), keypoints (1, N, 2) and points (1, N, 3). The number of
+    views and points, the size and the depth range are fixed. The file is written once it has given
+    the same depth as the network, to 1e-3 at every pixel of a procedural room.
+
+    Example: deltas export --out deltas.onnx --views 3 --size 240 320
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """File to write; its suffix, .onnx or .pt2, is the format."""
+    weights: str = "deltas-small"
+    """A shipped network, or a weights file of `deltas train`."""
+    views: int = 3
+    """Views, the anchor included."""
+    points: int = 512
+    """Points to triangulate."""
+    size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (240, 320)
+    """Of the images."""
+    depth_range: tuple[float, float] = (0.5, 10.0)
+    """Nearest and farthest depth searched, metres."""
+    refinement: int = 8
+    """Samples in each bin of inverse depth. The network takes 8 at most; fewer are faster, and
+    coarser where views are far apart."""
+    overwrite: Flag = False
+    """Replace --out if it exists."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Do it."""
+        from deltas_nets.export import ExportConfig, export_onnx, export_program
+        from deltas_nets.network.deltas import Deltas
+        from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.predict.predictor import load_network
+        from deltas_nets.weights_file import weights_record
+
+        writers = {".onnx": export_onnx, ".pt2": export_program}
+        if self.out.suffix not in writers:
+            raise UserError("the suffix is the format", f"--out {self.out}", "use .onnx or .pt2")
+        if self.out.exists() and not self.overwrite:
+            raise UserError("the file exists", self.out, "add --overwrite or name another")
+        try:
+            config = ExportConfig(
+                self.views, self.points, self.size, self.depth_range, self.refinement
+            )
+        except ValueError as error:
+            raise UserError(str(error), "command line", "see deltas export --help") from None
+        check_writable(self.out.parent)
+        network = load_network(self.weights)
+        if not isinstance(network, Deltas):
+            what = "the published network is not exported"
+            raise UserError(what, self.weights, "name weights of deltas train")
+        # Only the name: where files are is the machine's, and private.
+        record = {**weights_record(self.weights), "name": Path(self.weights).name}
+        agreement = writers[self.out.suffix](network, self.out, config, weights=record)
+        megabytes = self.out.stat().st_size / 1e6
+        print(
+            f"{self.out} ({megabytes:.1f} MB) gives the network's depth "
+            f"to {agreement.relative:.1g} of it"
+        )

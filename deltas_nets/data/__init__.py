@@ -1,1 +1,0 @@
-"""Captures, view sets, samples and procedural rooms."""

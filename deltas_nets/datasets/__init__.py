@@ -1,0 +1,1 @@
+"""What is trained on, and how pictures are changed on the way."""

@@ -1,0 +1,1 @@
+"""A detector that learns interest points from another one."""

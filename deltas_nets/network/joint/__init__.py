@@ -1,0 +1,1 @@
+"""The matcher that decides with all views at once."""

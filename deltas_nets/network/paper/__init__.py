@@ -1,0 +1,1 @@
+"""Stages of the paper's networks."""

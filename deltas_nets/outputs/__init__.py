@@ -1,0 +1,1 @@
+"""Files of results, whole whenever they exist."""

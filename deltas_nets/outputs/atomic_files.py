@@ -1,0 +1,120 @@
+"""Files that are whole whenever they exist, and JSON.
+
+Every file is written under a temporary name beside it, brought to the disk and renamed, which is
+atomic there.
+"""
+
+import contextlib
+import json
+import math
+import os
+import re
+import secrets
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from deltas_nets.errors import UserError
+
+__all__ = [
+    "TEMPORARY",
+    "cannot_write",
+    "check_writable",
+    "plain",
+    "write_atomically",
+    "write_json",
+]
+
+TEMPORARY = re.compile(r"\..*\.deltas-tmp$")
+"""Names of files that a killed run left half written."""
+
+
+def write_json(path: Path, obj: object) -> None:
+    """Write JSON that a person can read; see `plain` for what becomes of other types."""
+    content = json.dumps(plain(obj), indent=2, allow_nan=False) + "\n"
+    write_atomically(path, lambda file: file.write(content.encode("utf-8")))
+
+
+def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Call ``write`` with a temporary file beside ``path``, then rename it to ``path``.
+
+    What is written is on the disk before the new name is, so that a power cut leaves the old file
+    or the new one.
+
+    Raises:
+        UserError: the system refuses; nothing is left behind then.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.deltas-tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Not tempfile, whose files are private to the user: outputs follow the umask.
+        with temporary.open("xb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise cannot_write(path, error) from error
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the names in a folder on the disk, where the system can: some know no such thing."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def check_writable(out: Path) -> None:
+    """Whether a folder can be made and filled; nothing of it is made.
+
+    A file is written where it would be: permission bits mislead on network drives and root.
+
+    Raises:
+        UserError: it is a file, or the system refuses.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError("this is a file, not a folder", out, "name a folder with --out")
+    parents = (out, *out.absolute().parents)
+    nearest = next(folder for folder in parents if folder.exists())
+    try:
+        with tempfile.NamedTemporaryFile(dir=nearest, prefix=".", suffix=".deltas-tmp") as file:
+            file.write(b"x")
+    except OSError as error:
+        raise cannot_write(out, error) from error
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """What to tell the user when the system refuses to write."""
+    what = f"cannot be written ({error.strerror or error})"
+    return UserError(what, path, "name a place that can be written and has space")
+
+
+def plain(value: object) -> object:
+    """The same as JSON knows it: tuples become lists, paths and infinities strings.
+
+    Example:
+        >>> plain({"depth_range": (0.5, float("inf")), "out": Path("maps")})
+        {'depth_range': [0.5, 'inf'], 'out': 'maps'}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)  # JSON has no such numbers, and readers refuse Python's words for them
+    return value

@@ -1,0 +1,59 @@
+"""The summaries that `deltas depth` leaves in its folder: what made the files there."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.errors import UserError
+
+WRITER = "deltas depth"
+"""Stands in summary.json and tells our folders from others."""
+SUMMARY = "summary.json"
+SHARD_SUMMARY = re.compile(r"summary\.\d+-of-\d+\.json")
+
+
+def shard_summary(out: Path, shard: tuple[int, int]) -> Path:
+    """Where one of several runs keeps its own."""
+    return out / f"summary.{shard[0]}-of-{shard[1]}.json"
+
+
+def read_summary(path: Path) -> dict[str, Any] | None:
+    """A summary of ours; None where there is none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(content, dict) or content.get("writer") != WRITER:
+        return None
+    dicts = all(isinstance(content.get(key), dict) for key in ("settings", "frames"))
+    return content if dicts else None
+
+
+def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
+    """The view sets of the run that filled a folder.
+
+    Raises:
+        UserError: no run of `deltas depth` did.
+    """
+    summary = read_summary(out / SUMMARY)
+    if summary is None or "view_sets" not in summary["settings"]:
+        raise UserError("no run of deltas depth is recorded", out / SUMMARY, "run it first")
+    return tuple(
+        ViewSet(anchor, tuple(sources)) for anchor, sources in summary["settings"]["view_sets"]
+    )
+
+
+def difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """The settings that differ, as the user would say it: ``views was 3, is 5``."""
+    before = earlier["settings"]
+    names = sorted(before.keys() | wanted.keys())
+    changed = [name for name in names if before.get(name) != wanted.get(name)]
+    words = []
+    for name in changed[:3]:
+        was, now = json.dumps(before.get(name)), json.dumps(wanted.get(name))
+        short = len(was) + len(now) < 60
+        words.append(f"{name} was {was}, is {now}" if short else f"{name} differs")
+    return "; ".join(words) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")

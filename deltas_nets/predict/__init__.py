@@ -1,0 +1,1 @@
+"""From frames to depth maps, by any network."""

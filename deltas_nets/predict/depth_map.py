@@ -1,0 +1,111 @@
+"""What is asked of a depth map, and what comes out."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from deltas_geom import PosedViews, unproject
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.work_size import resize_image
+from deltas_nets.network.deltas import DepthPrediction
+
+
+@dataclass(frozen=True)
+class PredictConfig:
+    """What a depth map depends on besides its frames and the weights."""
+
+    depth_range: tuple[float, float] = (0.5, 10.0)
+    """Nearest and farthest depth searched, metres."""
+    work_size: tuple[int, int] | None = None
+    """(height, width) that the network sees; chosen to suit it if not given."""
+    size: tuple[int, int] | None = None
+    """(height, width) of the maps; the colour image's own if not given."""
+    min_confidence: float = 0.0
+    """Pixels of less confidence (0 to 1) are left out; 0 keeps every pixel."""
+
+    def __post_init__(self) -> None:
+        near, far = self.depth_range
+        if not 0 < near < far:
+            raise ValueError(
+                f"--depth-range must be NEAR FAR with 0 < NEAR < FAR, got {near} {far}"
+            )
+        for name, size in (("--work-size", self.work_size), ("--size", self.size)):
+            if size is not None and min(size) < 32:
+                raise ValueError(f"{name} must be HEIGHT WIDTH of 32 or more, got {size}")
+        if not 0 <= self.min_confidence <= 1:
+            raise ValueError(f"--min-confidence must be within 0 to 1, got {self.min_confidence}")
+
+
+class KeypointDepths(NamedTuple):
+    """Triangulated depth of an anchor's keypoints.
+
+    Attributes:
+        pixels: ``(N, 2)`` at the size that the network works at.
+        depth: ``(N,)`` metres, 0 where there is none.
+        image_size: (height, width) of that size.
+    """
+
+    pixels: torch.Tensor
+    depth: torch.Tensor
+    image_size: tuple[int, int]
+
+
+class DepthMap(NamedTuple):
+    """What any network says of a frame: what is written and scored.
+
+    Attributes:
+        depth: ``(H, W)`` float32 metres; 0 where there is none.
+        confidence: ``(H, W)`` float32 as in `FrameDepth`; None where the network states none.
+        points: ``(N, 3)`` in the capture's world, metres.
+        colors: ``(N, 3)`` uint8.
+        keypoints: the points that the map rests on.
+    """
+
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32] | None
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    keypoints: KeypointDepths
+
+
+def keypoint_depths(prediction: DepthPrediction) -> KeypointDepths:
+    """The triangulated points of a prediction without batch dims."""
+    return KeypointDepths(
+        prediction.keypoints.pixels,
+        prediction.points.depth[0],
+        (prediction.depth.shape[-2], prediction.depth.shape[-1]),
+    )
+
+
+def resized(image: torch.Tensor, size: tuple[int, int]) -> NDArray[np.float32]:
+    """An image ``(1, h, w)`` at another size ``(H, W)``, linearly between its pixels."""
+    resized = F.interpolate(image[None], size=size, mode="bilinear", align_corners=False)
+    array: NDArray[np.float32] = resized[0, 0].float().cpu().numpy()
+    return array
+
+
+def point_cloud(
+    anchor: Frame, depth: NDArray[np.float32], size: tuple[int, int], work_size: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """World points of the map, about as many as the network has pixels, with their colours."""
+    step = max(1, round(size[0] / work_size[0]))
+    rows, columns = np.mgrid[step // 2 : size[0] : step, step // 2 : size[1] : step].reshape(2, -1)
+    z = torch.from_numpy(depth[rows, columns]).double()
+    view = PosedViews(
+        torch.tensor(anchor.K)[None], torch.tensor(anchor.cam_from_world)[None]
+    ).resize(old_size=anchor.image_size, new_size=size)
+    pixels = torch.from_numpy(np.stack([columns, rows], axis=-1)).double()
+    points = unproject(view, pixels[None], z[None])[0]
+    colors = resize_image(anchor.read_image(), size)[rows, columns]
+    known = z.numpy() > 0
+    return points.numpy()[known].astype(np.float32), colors[known]
+
+
+def frames_of(capture: Capture, views: ViewSet) -> list[Frame]:
+    """The anchor, then its sources."""
+    return [capture.frame(id) for id in (views.anchor, *views.sources)]

@@ -1,0 +1,157 @@
+"""Weights in files: the shipped ones by name, others by path; safetensors only."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from deltas_nets.config import NetworkConfig, from_dict, to_dict
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.outputs.atomic_files import write_atomically
+
+DEFAULT = "deltas-small"
+FORMAT = "1"
+
+
+def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = "cpu") -> Deltas:
+    """A trained network, ready to predict.
+
+    Args:
+        name_or_file: a shipped network ("deltas-small"), or a weights file of `deltas train`.
+        device: where to put it.
+
+    Raises:
+        UserError: no such network or file, or the file holds something else.
+
+    Example:
+        >>> load_model().config.name
+        'deltas-small'
+    """
+    file = weights_file(name_or_file)
+    metadata = read_metadata(file)
+    if "network" not in metadata:
+        raise UserError("this file holds no deltas network", file, "name a file of deltas train")
+    try:
+        config = from_dict(NetworkConfig, json.loads(metadata["network"]))
+    except (KeyError, ValueError, TypeError) as error:
+        raise UserError(
+            f"weights of another version ({error})", file, "train again or install that version"
+        ) from None
+    model = Deltas(config)
+    load_weights(model, file)
+    return model.to(device).eval()
+
+
+def weights_file(name_or_file: str | Path) -> Path:
+    """The file of a shipped network's name, or the given file."""
+    file = Path(name_or_file)
+    shipped = Path(str(files("deltas_nets") / "weights" / f"{name_or_file}.safetensors"))
+    if file.suffix != ".safetensors" and shipped.is_file():
+        return shipped
+    if not file.is_file():
+        raise UserError(
+            "no such weights", file, f"name a .safetensors file or a shipped network ({DEFAULT})"
+        )
+    return file
+
+
+def read_metadata(file: Path) -> dict[str, str]:
+    """Config, data, seed, step and licence recorded in a weights file.
+
+    Raises:
+        UserError: not a safetensors file.
+    """
+    try:
+        with safe_open(str(file), framework="pt") as opened:
+            metadata: dict[str, str] | None = opened.metadata()
+    except (SafetensorError, OSError) as error:
+        raise UserError(
+            f"not a safetensors file ({error})",
+            file,
+            "name the weights.safetensors that deltas train wrote",
+        ) from None
+    return metadata or {}
+
+
+def weights_record(name: str) -> dict[str, str]:
+    """What identifies weights by name or file, and where they come from."""
+    file = weights_file(name)
+    metadata = read_metadata(file)
+    record = {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    for key in ("step", "seed", "data", "origin"):
+        if key in metadata:
+            record[key] = metadata[key]
+    return record
+
+
+def load_weights(model: torch.nn.Module, file: Path) -> None:
+    """Copy a file's weights into a model of the same shape.
+
+    Raises:
+        UserError: a weight is missing, left over or of another shape.
+    """
+    with safe_open(str(file), framework="pt") as opened:
+        names = opened.keys()
+        state: dict[str, Tensor] = {name: opened.get_tensor(name) for name in names}
+    _load(model, state, file)
+
+
+def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
+    """Copy a file's weights into a model that may have grown since; training goes on from there.
+
+    Returns:
+        Weights that the file lacks: they stay as they are.
+
+    Raises:
+        UserError: a weight is left over or of another shape, or more than half are lacking: these
+            are another network's.
+    """
+    with safe_open(str(file), framework="pt") as opened:
+        state = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    own = model.state_dict()
+    grown = {name: value for name, value in own.items() if name not in state}
+    if 2 * len(grown) > len(own):
+        raise UserError(
+            f"weights do not fit the network ({len(grown)} of {len(own)} are lacking)",
+            file,
+            "name a weights file of this kind of network",
+        )
+    _load(model, {**grown, **state}, file)
+    return list(grown)
+
+
+def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
+    try:
+        model.load_state_dict(state)
+    except RuntimeError as error:
+        first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
+        raise UserError(
+            f"weights do not fit the network ({first})", file, "use the config they were trained by"
+        ) from None
+
+
+def save_weights(file: Path, model: Deltas, metadata: Mapping[str, str]) -> None:
+    """Write weights and where they come from, atomically.
+
+    Args:
+        file: ends in .safetensors.
+        model: on any device.
+        metadata: recorded beside the network's config: data, seed, step, licence.
+    """
+    state = {
+        name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
+    }
+    record = {
+        **metadata,
+        "format": FORMAT,
+        "network": json.dumps(to_dict(model.config)),
+        "torch": torch.__version__,
+    }
+    write_atomically(file, lambda opened: opened.write(save(state, metadata=record)))
