@@ -53,7 +53,7 @@ def losses_of(model: Deltas, config: TrainConfig) -> dict[str, float]:
         for step, rooms in enumerate(room_loader(held_out, start=0, stop=HELD_OUT)):
             losses: Losses = objective(maker(rooms, step))
             for name in FIVE:
-                total[name] += float(getattr(losses, name)) / HELD_OUT
+                total[name] += float(losses.terms[name]) / HELD_OUT
     return total
 
 

@@ -2,8 +2,9 @@
 
 import dataclasses
 
+from deltas_nets.config.losses import PAPER_LOSS
 from deltas_nets.config.network import DetectorConfig, MatcherConfig, NetworkConfig
-from deltas_nets.config.training import DataConfig, LossConfig, TrainConfig
+from deltas_nets.config.training import DataConfig, TrainConfig
 
 _PAPER_DETECTOR = DetectorConfig(num_keypoints=512, nms_radius=9, border=4, fine_width=0)
 _PAPER_MATCHER = MatcherConfig(kind="per_view", num_samples=100)
@@ -29,11 +30,6 @@ CONFIGS: dict[str, NetworkConfig] = {
     ),
 }
 """Networks by name; the second is the paper's, the third the light one of its supplement."""
-
-PAPER_LOSS = LossConfig(
-    match=1.0, smoothness=1.0, gradient=0.0, posterior=0.0, confidence=0.0, spread=0.0
-)
-"""The five terms with the paper's weights, and no other."""
 
 
 def _as_in_the_paper(name: str) -> TrainConfig:

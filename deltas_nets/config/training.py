@@ -1,42 +1,14 @@
-"""What a training run depends on: losses, data and schedule."""
+"""What a training run depends on: data and schedule, and the weights of its losses."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import tyro
 
 from deltas_nets.config.checks import check_at_least, check_positive, check_seed, check_share
+from deltas_nets.config.losses import LossConfig
 from deltas_nets.config.network import NetworkConfig
 from deltas_nets.config.scannet import ScanNetConfig
-
-
-@dataclass(frozen=True)
-class LossConfig:
-    """Weights of the loss terms; the first five are the paper's terms."""
-
-    detector: float = 0.1
-    """Cross-entropy of interest points."""
-    match: float = 0.1
-    """Smooth L1 of 2D matches, pixels."""
-    point: float = 2.0
-    """Smooth L1 of 3D points, relative to their depth."""
-    smoothness: float = 0.02
-    """Edge-aware smoothness of the dense map."""
-    depth: float = 2.0
-    """Smooth L1 of log depth at the finest of four scales."""
-    scale_decay: float = 0.7
-    """Factor of the depth term from a scale to the next coarser one (the paper: 0.7)."""
-    gradient: float = 2.0
-    """L1 of the gradient of log depth at the two finest scales: keeps edges where they are."""
-    posterior: float = 1.0
-    """Cross-entropy of the posterior over inverse depth, at every stage."""
-    confidence: float = 0.5
-    """Cross-entropy of the points' confidence."""
-    spread: float = 0.2
-    """Laplace likelihood of the dense map's own uncertainty."""
-
-    def __post_init__(self) -> None:
-        check_at_least(0, self, *(term.name for term in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 
-class Counts:
-    """Of a batch that is whole."""
+class Divisors:
+    """What sums are divided by where one pass of one process sees the whole batch."""
 
     def divisor(self, count: Tensor) -> Tensor:
         """What to divide a sum over ``count`` places by; 1 where the batch has none.
@@ -24,11 +24,11 @@ class Counts:
         return count.clamp_min(1)
 
 
-WHOLE = Counts()
+WHOLE = Divisors()
 
 
-class CountsOverProcesses(Counts):
-    """Of a batch whose parts other processes hold: each count is summed when it is needed.
+class DivisorsOverProcesses(Divisors):
+    """Other processes hold parts of the batch: each count is summed when it is needed.
 
     Args:
         add_up: sum of an int64 scalar over all processes; each of them calls it for each term.
@@ -44,8 +44,8 @@ class CountsOverProcesses(Counts):
         return self.add_up(count).clamp_min(1) / self.parts
 
 
-class CountsToCome(Counts):
-    """Writes the counts of a first pass down; its means are of no use."""
+class DivisorsToCome(Divisors):
+    """Remembers the counts of a first pass, whose means are of no use."""
 
     def __init__(self) -> None:
         self.seen: list[Tensor] = []
@@ -60,8 +60,8 @@ class CountsToCome(Counts):
         return torch.stack(self.seen)
 
 
-class KnownCounts(Counts):
-    """Of a batch of which all parts were counted before.
+class KnownDivisors(Divisors):
+    """All parts of the batch were counted before.
 
     Args:
         totals: ``(terms,)`` int64 over all parts, in the order in which the losses ask.

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
-from deltas_nets.config import TrainConfig
+from deltas_nets.config import LOSS_FUNCTIONS, TrainConfig
 from deltas_nets.distill.supervision import TeacherLabels
 from deltas_nets.losses.divisors import (
     WHOLE,
-    Counts,
-    CountsOverProcesses,
-    CountsToCome,
-    KnownCounts,
+    Divisors,
+    DivisorsOverProcesses,
+    DivisorsToCome,
+    KnownDivisors,
 )
 from deltas_nets.losses.losses import Losses, training_losses
 from deltas_nets.network.deltas import Deltas
@@ -42,7 +42,7 @@ class Objective(nn.Module):
         self.model = model
         self.config = config
 
-    def forward(self, batch: Batch, counts: Counts = WHOLE) -> Losses:
+    def forward(self, batch: Batch, divisors: Divisors = WHOLE) -> Losses:
         """The losses of a batch or of a part of one."""
         # Not Fabric's mixed precision: it would round the cameras to half precision as well.
         mixed = self.config.precision == "bf16-mixed"
@@ -62,7 +62,7 @@ class Objective(nn.Module):
             self.config.loss,
             depth_range=DEPTH_RANGE,
             labels=batch.labels,
-            counts=counts,
+            divisors=divisors,
         )
 
 
@@ -117,15 +117,17 @@ class Stepper:
         """
         fabric = self.fabric
         passes = [self._taught(part) for part in batch.split(self.config.accumulate)]
-        counts_of_a_pass, statistics = self._counts(passes), Statistics(self.objective)
+        divisors_of_a_pass, statistics = self._divisors(passes), Statistics(self.objective)
         self.optimizer.zero_grad()
-        totals = torch.zeros(len(Losses._fields), device=batch.images.device)
+        names = (*LOSS_FUNCTIONS, "total")
+        totals = torch.zeros(len(names), device=batch.images.device)
         for number, part in enumerate(passes):
             more = number < len(passes) - 1
             with fabric.no_backward_sync(self.wrapped, enabled=more):
-                losses: Losses = self.wrapped(part, counts_of_a_pass())
+                losses: Losses = self.wrapped(part, divisors_of_a_pass())
                 fabric.backward(losses.total / len(passes))
-            totals += torch.stack(losses).detach() / len(passes)
+            values = torch.stack([*losses.terms.values(), losses.total]).detach()
+            totals += values / len(passes)
         norm = fabric.clip_gradients(
             self.wrapped,
             self.optimizer,
@@ -142,24 +144,22 @@ class Stepper:
             statistics.restore()  # they have seen what was not finite
         else:
             self.optimizer.step()
-        return StepResult(
-            dict(zip(Losses._fields, means, strict=True)), done=not skip, stop=stopping > 0
-        )
+        return StepResult(dict(zip(names, means, strict=True)), done=not skip, stop=stopping > 0)
 
     def _taught(self, batch: Batch) -> Batch:
         if self.teacher is None:
             return batch
         return batch._replace(labels=self.teacher(batch.anchors))
 
-    def _counts(self, passes: list[Batch]) -> Callable[[], Counts]:
+    def _divisors(self, passes: list[Batch]) -> Callable[[], Divisors]:
         if len(passes) > 1:
             # What counts depends on the predictions, and a gradient that was added up cannot be
             # divided term by term afterwards: a pass without gradient counts first.
             parts = len(passes) * self.fabric.world_size
-            return partial(KnownCounts, self._count(passes), parts)
+            return partial(KnownDivisors, self._count(passes), parts)
         if self.fabric.world_size > 1:
-            return partial(CountsOverProcesses, self._add_up, self.fabric.world_size)
-        return Counts
+            return partial(DivisorsOverProcesses, self._add_up, self.fabric.world_size)
+        return Divisors
 
     @torch.no_grad()
     def _count(self, passes: list[Batch]) -> Tensor:
@@ -167,9 +167,9 @@ class Stepper:
         seen = []
         statistics = Statistics(self.objective)
         for part in passes:
-            counts = CountsToCome()
-            self.objective(part, counts)
-            seen.append(counts.all())
+            divisors = DivisorsToCome()
+            self.objective(part, divisors)
+            seen.append(divisors.all())
         statistics.restore()
         return self._add_up(torch.stack(seen).sum(dim=0))
 

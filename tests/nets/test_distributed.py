@@ -25,8 +25,13 @@ from torch import Tensor, nn
 
 from deltas_nets.config import CONFIGS, MatcherConfig, NetworkConfig, TrainConfig
 from deltas_nets.errors import UserError
-from deltas_nets.losses.divisors import Counts, CountsOverProcesses, CountsToCome, KnownCounts
-from deltas_nets.losses.losses import masked_mean
+from deltas_nets.losses.divisors import (
+    Divisors,
+    DivisorsOverProcesses,
+    DivisorsToCome,
+    KnownDivisors,
+)
+from deltas_nets.losses.seen import masked_mean
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module
@@ -129,9 +134,9 @@ def test_means_of_parts_average_to_the_mean_of_the_whole(
     values = [torch.arange(5.0) + value for _, value in parts]
     masks = [torch.arange(5) < count for count, _ in parts]
     total = torch.stack([mask.sum() for mask in masks]).sum()
-    make: dict[str, Callable[[], Counts]] = {
-        "processes": lambda: CountsOverProcesses(lambda count: total, len(parts)),
-        "passes": lambda: KnownCounts(total[None], len(parts)),
+    make: dict[str, Callable[[], Divisors]] = {
+        "processes": lambda: DivisorsOverProcesses(lambda count: total, len(parts)),
+        "passes": lambda: KnownDivisors(total[None], len(parts)),
     }
     means = [masked_mean(*pair, make[kind]()) for pair in zip(values, masks, strict=True)]
     whole = masked_mean(torch.cat(values), torch.cat(masks))
@@ -142,20 +147,19 @@ def test_a_first_pass_counts_what_the_second_asks_for() -> None:
     model = Deltas(CONFIG.network)
     objective = Objective(model, CONFIG)
     batch = BatchMaker(CONFIG)(next(iter(room_loader(CONFIG, start=0, stop=1))), 0)
-    whole, halves = CountsToCome(), [CountsToCome(), CountsToCome()]
+    whole, halves = DivisorsToCome(), [DivisorsToCome(), DivisorsToCome()]
     frozen = replace(CONFIG, freeze_batch_norm=True)
     prepare_batch_norm(model, frozen, processes=1)
     with torch.no_grad():
         losses = objective(batch, whole)
-        for half, counts in zip(batch.split(2), halves, strict=True):
-            objective(half, counts)
+        for half, divisors in zip(batch.split(2), halves, strict=True):
+            objective(half, divisors)
         total = halves[0].all() + halves[1].all()
         assert torch.equal(total, whole.all())
         assert (total > 0).sum() > 10
-        parts = [objective(half, KnownCounts(total, 2)) for half in batch.split(2)]
-    for name in losses._fields:
-        mean = (getattr(parts[0], name) + getattr(parts[1], name)) / 2
-        torch.testing.assert_close(mean, getattr(losses, name), rtol=1e-4, atol=1e-6)
+        parts = [objective(half, KnownDivisors(total, 2)) for half in batch.split(2)]
+    means = {name: (one + parts[1].terms[name]) / 2 for name, one in parts[0].terms.items()}
+    torch.testing.assert_close(means, losses.terms, rtol=1e-4, atol=1e-6)
 
 
 ALONE = NetworkConfig(matcher=MatcherConfig(num_samples=16, context_rounds=0))
