@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from deltas_nets.config.checks import check_at_least, check_finite, check_positive, check_share
+from deltas_nets.config.encoders import ENCODERS, Backbone
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class NetworkConfig:
     name: str = "deltas-small"
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
-    backbone: Literal["lite", "resnet50", "vgg9"] = "lite"
+    backbone: Backbone = "lite"
     """Image encoder: lite is EfficientNet-Lite0; the others are the paper's and bring its heads and
     densifier."""
     descriptor_dim: int = 48
@@ -87,14 +88,17 @@ class NetworkConfig:
     decoder, coarse to fine."""
 
     def __post_init__(self) -> None:
-        wanted = 4 if self.backbone == "lite" else 5
+        if self.backbone not in ENCODERS:
+            raise ValueError(f"backbone must be one of {', '.join(ENCODERS)}, got {self.backbone}")
+        lite = ENCODERS[self.backbone].stages == "lite"
+        wanted = 4 if lite else 5
         if len(self.densifier_widths) != wanted:
             raise ValueError(
                 f"densifier_widths must be {wanted} numbers for {self.backbone}, got "
                 f"{self.densifier_widths}"
             )
         check_at_least(1, self, "descriptor_dim", "head_width", "densifier_widths")
-        if self.backbone != "lite" and self.matcher.kind == "joint":
+        if not lite and self.matcher.kind == "joint":
             raise ValueError(f"the joint matcher needs the lite backbone, got {self.backbone}")
-        if self.backbone != "lite" and self.descriptor_stride != 2:
+        if not lite and self.descriptor_stride != 2:
             raise ValueError(f"descriptor_stride is of the lite backbone, got {self.backbone}")

@@ -11,7 +11,7 @@ from deltas_nets.datasets.augment import Photometry
 from deltas_nets.distill.adaptation import adapted_scores
 from deltas_nets.distill.pictures import draw_pictures
 from deltas_nets.distill.teachers import Teacher
-from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.lite.encoder import LiteEncoder
 
 
 class Lessons(NamedTuple):
@@ -19,8 +19,8 @@ class Lessons(NamedTuple):
 
     Attributes:
         images: ``(N, 3, H, W)`` uint8 as the student sees them.
-        eighth: ``(N, 40, H/8, W/8)`` float16 features.
-        sixteenth: ``(N, 112, H/16, W/16)`` float16 features.
+        eighth: ``(N, C, H/8, W/8)`` float16 features.
+        sixteenth: ``(N, C, H/16, W/16)`` float16 features.
         scores: ``(N, 1, H, W)`` float16 of the teacher.
     """
 
@@ -32,7 +32,7 @@ class Lessons(NamedTuple):
 
 @torch.no_grad()
 def prepare(
-    encoder: Encoder,
+    encoder: LiteEncoder,
     teacher: Teacher,
     config: DistillConfig,
     *,

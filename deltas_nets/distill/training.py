@@ -27,7 +27,7 @@ from deltas_nets.distill.teachers import LICENCES, load_teacher
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.features import Features
-from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.outputs.atomic_files import check_writable
 from deltas_nets.weights_file import load_model, read_metadata, save_weights, weights_file
 
@@ -87,7 +87,7 @@ def distill(
     source = weights_file(config.init)
     model = load_model(config.init)
     encoder = model.encoder
-    if not isinstance(encoder, Encoder):
+    if not isinstance(encoder, LiteEncoder):
         raise UserError("only deltas-small has a detector to distil into", source, "use --init")
     if config.fine_width and not model.config.detector.fine_width:
         model = with_fine_branch(model, config)
@@ -146,7 +146,7 @@ def train_detector(
         The losses.
     """
     encoder = model.encoder
-    assert isinstance(encoder, Encoder)
+    assert isinstance(encoder, LiteEncoder)
     model.eval().requires_grad_(False)
     model.detector.train().requires_grad_(True)
     optimizer = torch.optim.AdamW(model.detector.parameters(), weight_decay=1e-4)
@@ -181,7 +181,7 @@ def check_learned(learned: Learned, config: DistillConfig) -> None:
         raise UserError(what, f"--learning-rate {config.learning_rate:g}", "give a lower one")
 
 
-def _features(encoder: Encoder, batch: Lessons) -> Features:
+def _features(encoder: LiteEncoder, batch: Lessons) -> Features:
     """As of one view each; the maps at 1/2 and 1/4 that no detector reads are left empty."""
     unread = batch.eighth.new_empty(len(batch.eighth), 1, 0, 0, 0)
     with torch.no_grad():

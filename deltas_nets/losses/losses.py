@@ -5,13 +5,13 @@ Which there are, and what they weigh, is in the table of `deltas_nets.config.los
 
 from collections.abc import Callable
 from functools import cache
-from importlib import import_module
 from typing import NamedTuple
 
 from torch import Tensor
 
 from deltas_geom import PosedViews
 from deltas_nets.config import LOSS_FUNCTIONS, LossConfig
+from deltas_nets.config.lookup import look_up
 from deltas_nets.losses.divisors import WHOLE, Divisors
 from deltas_nets.losses.seen import Seen
 from deltas_nets.losses.targets import detector_labels, keypoint_targets
@@ -33,11 +33,7 @@ class Losses(NamedTuple):
 @cache
 def loss_functions() -> dict[str, Callable[[Seen], Tensor]]:
     """The functions that the table names."""
-    homes = {name: home.split(":") for name, home in LOSS_FUNCTIONS.items()}
-    return {
-        name: getattr(import_module(f"deltas_nets.losses.{module}"), function)
-        for name, (module, function) in homes.items()
-    }
+    return {name: look_up("deltas_nets.losses", place) for name, place in LOSS_FUNCTIONS.items()}
 
 
 def training_losses(

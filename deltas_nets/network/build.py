@@ -3,12 +3,14 @@
 from typing import NamedTuple
 
 from deltas_nets.config import MatcherConfig, NetworkConfig
+from deltas_nets.config.encoders import ENCODERS
+from deltas_nets.config.lookup import look_up
 from deltas_nets.network.joint.judge import Judge
 from deltas_nets.network.joint.matcher import JointMatcher
 from deltas_nets.network.lite.densifier import Densifier
 from deltas_nets.network.lite.descriptor import Descriptor
 from deltas_nets.network.lite.detector import Detector
-from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.paper.paper import (
     PaperDensifier,
     PaperDescriptor,
@@ -16,9 +18,7 @@ from deltas_nets.network.paper.paper import (
     PaperEncoder,
 )
 from deltas_nets.network.paper.per_view_matcher import PerViewMatcher
-from deltas_nets.network.paper.resnet import ResNet50
 from deltas_nets.network.paper.taps import Backbone
-from deltas_nets.network.paper.vgg import VGG9
 
 Matcher = JointMatcher | PerViewMatcher
 
@@ -29,7 +29,7 @@ class Stages(NamedTuple):
     Only the joint matcher has a judge.
     """
 
-    encoder: Encoder | PaperEncoder
+    encoder: LiteEncoder | PaperEncoder
     detector: Detector | PaperDetector
     descriptor: Descriptor | PaperDescriptor
     matcher: Matcher
@@ -39,19 +39,29 @@ class Stages(NamedTuple):
 
 def build_stages(config: NetworkConfig) -> Stages:
     """The stages that a config names."""
+    row = ENCODERS[config.backbone]
+    encoder = look_up("deltas_nets.network", row.place)
     matcher = build_matcher(config.matcher, config.descriptor_dim)
-    if config.backbone == "lite":
-        return Stages(
-            Encoder(),
-            Detector(config.detector),
-            Descriptor(config.descriptor_dim, config.descriptor_stride),
-            matcher,
-            Judge(config.matcher.window) if config.matcher.kind == "joint" else None,
-            Densifier(_four(config.densifier_widths)),
-        )
-    backbones: dict[str, type[Backbone]] = {"resnet50": ResNet50, "vgg9": VGG9}
-    backbone = backbones[config.backbone]
-    image, sparse = backbone(3, 64), backbone(1, 16)
+    if row.stages == "lite":
+        return _lite_stages(config, encoder(), matcher)
+    return _paper_stages(config, encoder(3, 64), encoder(1, 16), matcher)
+
+
+def _lite_stages(config: NetworkConfig, encoder: LiteEncoder, matcher: Matcher) -> Stages:
+    channels = encoder.channels
+    return Stages(
+        encoder,
+        Detector(config.detector, channels),
+        Descriptor(config.descriptor_dim, channels, config.descriptor_stride),
+        matcher,
+        Judge(config.matcher.window) if config.matcher.kind == "joint" else None,
+        Densifier(_four(config.densifier_widths), channels),
+    )
+
+
+def _paper_stages(
+    config: NetworkConfig, image: Backbone, sparse: Backbone, matcher: Matcher
+) -> Stages:
     return Stages(
         PaperEncoder(image),
         PaperDetector(config.detector, image.channels, config.head_width),

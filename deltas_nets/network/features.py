@@ -11,11 +11,11 @@ class Features(NamedTuple):
     """Feature maps of B x V images; at stride r the image plane is sampled r times coarser.
 
     Attributes:
-        fine: ``(B, V, 16, H/2, W/2)`` straight from the pixels, for exact localisation.
-        half: ``(B, V, 16, H/2, W/2)``.
-        quarter: ``(B, V, 24, H/4, W/4)``.
-        eighth: ``(B, V, 40, H/8, W/8)``.
-        sixteenth: ``(B, V, 112, H/16, W/16)``.
+        fine: ``(B, V, C, H/2, W/2)`` straight from the pixels, for exact localisation.
+        half: ``(B, V, C, H/2, W/2)``.
+        quarter: ``(B, V, C, H/4, W/4)``.
+        eighth: ``(B, V, C, H/8, W/8)``.
+        sixteenth: ``(B, V, C, H/16, W/16)``.
     """
 
     fine: Tensor
@@ -43,5 +43,11 @@ class Features(NamedTuple):
         return Features(*(feature.flatten(0, 1) for feature in self))
 
 
-CHANNELS = Features(16, 16, 24, 40, 112)  # type: ignore[arg-type]
-"""Channels of each map."""
+class Channels(NamedTuple):
+    """Of each map of :class:`Features`; the later stages are built for them."""
+
+    fine: int
+    half: int
+    quarter: int
+    eighth: int
+    sixteenth: int

@@ -7,13 +7,13 @@ from torch.utils.data import Subset
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.datasets.posed_images import PosedImages
-from deltas_nets.datasets.tuples import ScanNetTuples, open_scannet
+from deltas_nets.datasets.scannet import ScanNetViewSets, open_scannet
 from deltas_nets.rooms import Rooms
 
 
 def training_data(
     config: TrainConfig, *, report: Callable[[str], None] = lambda _: None
-) -> Rooms | ScanNetTuples:
+) -> Rooms | ScanNetViewSets:
     """What the config wants to train on.
 
     Args:
@@ -53,7 +53,7 @@ def validation_data(
 
 def _frames(
     config: TrainConfig, split: str, option: str, report: Callable[[str], None]
-) -> ScanNetTuples:
+) -> ScanNetViewSets:
     data = config.data
     return open_scannet(
         data.scannet,

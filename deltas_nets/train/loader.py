@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.datasets.posed_images import PosedImages
-from deltas_nets.datasets.tuples import ScanNetTuples
+from deltas_nets.datasets.scannet import ScanNetViewSets
 from deltas_nets.datasets.workers import leave_to_the_parent
 from deltas_nets.errors import UserError
 from deltas_nets.rooms import Rooms
@@ -87,7 +87,7 @@ class StepSampler(Sampler[list[int]]):
 
 
 def step_loader(
-    data: Rooms | ScanNetTuples,
+    data: Rooms | ScanNetViewSets,
     config: TrainConfig,
     *,
     start: int,
@@ -140,7 +140,7 @@ def room_loader(
 class _OrError(Dataset[PosedImages | UserError]):
     """Errors as items: of one that a worker raises nothing but its traceback comes through."""
 
-    def __init__(self, data: Rooms | ScanNetTuples) -> None:
+    def __init__(self, data: Rooms | ScanNetViewSets) -> None:
         self.data = data
 
     def __getitem__(self, index: int) -> PosedImages | UserError:

@@ -10,11 +10,7 @@ from deltas_nets.network.deltas import Deltas
 
 def make_optimizer(model: Deltas, config: TrainConfig) -> torch.optim.Optimizer:
     """AdamW; the pretrained encoder learns at a share of the rate."""
-    pretrained = [
-        parameter
-        for name, parameter in model.encoder.named_parameters()
-        if not name.startswith("fine.")
-    ]
+    pretrained = model.encoder.pretrained_parameters()
     known = {id(parameter) for parameter in pretrained}
     fresh = [parameter for parameter in model.parameters() if id(parameter) not in known]
     rate = config.learning_rate

@@ -31,7 +31,7 @@ class Start:
     """What a run starts from.
 
     Attributes:
-        encoder: an EfficientNet-Lite0 checkpoint for the encoder.
+        encoder: a public checkpoint for the encoder.
         init: a weights file for the whole network, which may have grown since.
         step: the first step, for a schedule that goes on from ``init``.
         resume: go on from the checkpoint in the run's folder.
@@ -88,7 +88,7 @@ def starting_state(
     origin = "random weights"
     if start.encoder is not None:
         model.encoder.load_pretrained(start.encoder)
-        origin = "encoder from EfficientNet-Lite0 (Apache-2.0)"
+        origin = f"encoder from {model.encoder.origin}"
     if start.init is not None:
         if not start.init.is_file():
             raise UserError("no such weights", start.init, "name a .safetensors file with --init")

@@ -15,7 +15,7 @@ from deltas_nets.network.lite.convex_upsampling import (
     convex_upsample,
 )
 from deltas_nets.network.lite.densifier import Densifier
-from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.lite.efficientnet import EfficientNetLite0
 
 WIDTHS = (8, 8, 8, 8)
 
@@ -203,14 +203,14 @@ def test_every_weight_of_the_untrained_head_learns() -> None:
 @pytest.fixture(scope="module")
 def densifier() -> Densifier:
     torch.manual_seed(0)
-    return Densifier(WIDTHS).eval()
+    return Densifier(WIDTHS, EfficientNetLite0.channels).eval()
 
 
 @given(height=st.integers(32, 48), width=st.integers(32, 48))
 def test_the_finest_map_is_as_large_as_the_image(
     densifier: Densifier, height: int, width: int
 ) -> None:
-    encoder = Encoder().eval()
+    encoder = EfficientNetLite0().eval()
     empty = torch.zeros(1, 1, height, width)
     with torch.no_grad():
         features = encoder(torch.rand(1, 1, 3, height, width))
@@ -223,8 +223,8 @@ def test_the_finest_map_is_as_large_as_the_image(
 
 
 def test_doubt_does_not_move_the_edges_of_depth() -> None:
-    densifier = Densifier(WIDTHS)
-    features = Encoder()(torch.rand(1, 1, 3, 48, 64))
+    densifier = Densifier(WIDTHS, EfficientNetLite0.channels)
+    features = EfficientNetLite0()(torch.rand(1, 1, 3, 48, 64))
     empty = torch.zeros(1, 1, 48, 64)
     densifier(features, SparseDepth(empty, empty)).log_spread.sum().backward()
     assert all(parameter.grad is None for parameter in densifier.upsampling.parameters())

@@ -11,7 +11,7 @@ from deltas_geom import PosedViews
 from deltas_nets.config import CONFIGS, NetworkConfig
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.descriptor import WIDTH, Descriptor
-from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.lite.efficientnet import EfficientNetLite0
 from deltas_nets.rooms import render_room
 from deltas_nets.weights_file import load_weights, weights_file
 
@@ -20,18 +20,18 @@ Stride = Literal[2, 4]
 
 
 @pytest.fixture(scope="module")
-def encoder() -> Encoder:
+def encoder() -> EfficientNetLite0:
     torch.manual_seed(0)
-    return Encoder().eval()
+    return EfficientNetLite0().eval()
 
 
 @given(stride=st.sampled_from(STRIDES), height=st.integers(20, 70), width=st.integers(20, 70))
 def test_descriptors_have_their_stride_and_unit_length(
-    encoder: Encoder, stride: Stride, height: int, width: int
+    encoder: EfficientNetLite0, stride: Stride, height: int, width: int
 ) -> None:
     with torch.no_grad():
         features = encoder(torch.rand(1, 2, 3, height, width))
-        descriptors = Descriptor(24, stride).eval()(features)
+        descriptors = Descriptor(24, EfficientNetLite0.channels, stride).eval()(features)
     assert descriptors.maps.shape == (1, 2, 24, -(-height // stride), -(-width // stride))
     assert descriptors.context.shape == (1, 2, WIDTH, -(-height // 8), -(-width // 8))
     length = torch.linalg.vector_norm(descriptors.maps, dim=2)
@@ -39,8 +39,8 @@ def test_descriptors_have_their_stride_and_unit_length(
 
 
 @pytest.mark.parametrize("stride", STRIDES)
-def test_every_weight_of_a_descriptor_learns(encoder: Encoder, stride: Stride) -> None:
-    descriptor = Descriptor(24, stride)
+def test_every_weight_of_a_descriptor_learns(encoder: EfficientNetLite0, stride: Stride) -> None:
+    descriptor = Descriptor(24, EfficientNetLite0.channels, stride)
     maps, context = descriptor(encoder(torch.rand(1, 2, 3, 32, 48)))
     (maps[:, 0].sum() + context.sum()).backward()
     assert [name for name, weight in descriptor.named_parameters() if weight.grad is None] == []

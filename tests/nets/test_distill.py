@@ -18,6 +18,8 @@ from stand_in_device import DEVICE, on_device, one_device
 from torch import Tensor, nn
 
 from deltas_nets.config import CONFIGS
+from deltas_nets.distill import pictures
+from deltas_nets.distill import training as distill_module
 from deltas_nets.distill.lessons import prepare
 from deltas_nets.distill.superpoint import SuperPoint
 from deltas_nets.distill.teachers import LICENCES, TEACHERS
@@ -30,8 +32,6 @@ from deltas_nets.distill.training import (
 )
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.train import distill as distill_module
-from deltas_nets.train import distill_pictures
 from deltas_nets.weights_file import load_model, read_metadata, save_weights, weights_file
 
 STEPS, PICTURES, LOOKS, ADAPTATION = 3, 2, 2, 2
@@ -40,7 +40,7 @@ STEPS, PICTURES, LOOKS, ADAPTATION = 3, 2, 2, 2
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the pixels: tests/nets/test_teachers.py distils at the size of use."""
-    for module in (distill_module, distill_pictures):
+    for module in (distill_module, pictures):
         monkeypatch.setattr(module, "IMAGE_SIZE", (64, 96))
 
 

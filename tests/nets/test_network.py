@@ -13,7 +13,7 @@ from deltas_nets.network.deltas import Deltas, DepthPrediction
 from deltas_nets.network.joint.context import Context
 from deltas_nets.network.lite.densifier import interpolate_sparse
 from deltas_nets.network.lite.detector import detector_heatmap, spread_points
-from deltas_nets.network.lite.encoder import Encoder
+from deltas_nets.network.lite.efficientnet import EfficientNetLite0
 from deltas_nets.rooms import render_room
 
 SIZE = (64, 96)
@@ -184,7 +184,7 @@ def test_the_small_network_keeps_within_its_budget() -> None:
 
 
 def test_encoder_strides_share_the_image_plane() -> None:
-    features = Encoder().eval()(torch.rand(1, 2, 3, 64, 96))
+    features = EfficientNetLite0().eval()(torch.rand(1, 2, 3, 64, 96))
     assert [feature.shape[-2:] for feature in features] == [
         (32, 48), (32, 48), (16, 24), (8, 12), (4, 6)
     ]  # fmt: skip

@@ -15,10 +15,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from deltas_nets.config import CONFIGS, TrainConfig
+from deltas_nets.distill import superpoint
 from deltas_nets.distill.labels import hard_labels, soft_labels
 from deltas_nets.distill.superpoint import SuperPoint, load_superpoint
 from deltas_nets.distill.supervision import TeacherLabels
-from deltas_nets.distill.teachers import load_teacher, superpoint
+from deltas_nets.distill.teachers import load_teacher
 from deltas_nets.errors import UserError
 from deltas_nets.losses.losses import training_losses
 from deltas_nets.losses.points import cell_entropy

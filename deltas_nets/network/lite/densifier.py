@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
 from deltas_geom.numerics.arithmetic import at_least_single
-from deltas_nets.network.features import CHANNELS, Features
+from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.convex_upsampling import ConvexUpsampling, convex_upsample
@@ -100,12 +100,17 @@ def interpolate_sparse(
 
 
 class Densifier(nn.Module):
-    """U-Net that corrects the interpolated log depth by what the image shows."""
+    """U-Net that corrects the interpolated log depth by what the image shows.
 
-    def __init__(self, widths: tuple[int, int, int, int]) -> None:
+    Args:
+        widths: at 1/2, 1/4, 1/8 and 1/16.
+        channels: of the features.
+    """
+
+    def __init__(self, widths: tuple[int, int, int, int], channels: Channels) -> None:
         super().__init__()
         half, quarter, eighth, sixteenth = widths
-        fine, tap2, tap4, tap8, tap16 = (int(channels) for channels in CHANNELS)
+        fine, tap2, tap4, tap8, tap16 = channels
         self.enter = ConvBlock(5, half)
         self.down4 = ConvBlock(half + tap4, quarter)
         self.down8 = ConvBlock(quarter, eighth, stride=2)

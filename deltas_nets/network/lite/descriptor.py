@@ -1,13 +1,13 @@
 """Descriptors of every view at half or quarter resolution, and a coarser map for context."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom.numerics.arithmetic import at_least_single
-from deltas_nets.network.features import CHANNELS, Features
+from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like
 
 WIDTH = 48
@@ -35,15 +35,16 @@ class Descriptor(nn.Module):
 
     Args:
         dim: D, channels of the descriptors.
+        channels: of the features.
         stride: pixels of the image from one descriptor to the next.
     """
 
-    def __init__(self, dim: int, stride: Literal[2, 4] = 2) -> None:
+    def __init__(self, dim: int, channels: Channels, stride: Literal[2, 4] = 2) -> None:
         super().__init__()
         self.stride = stride
-        taps = self._taps(CHANNELS)
-        fine = int(CHANNELS.fine) if stride == 2 else 0
-        self.lateral = nn.ModuleList([nn.Conv2d(int(channels), WIDTH, 1) for channels in taps])
+        taps = self._taps(channels)
+        fine = channels.fine if stride == 2 else 0
+        self.lateral = nn.ModuleList([nn.Conv2d(inputs, WIDTH, 1) for inputs in taps])
         self.merge = nn.ModuleList([ConvBlock(WIDTH, WIDTH) for _ in taps[:-1]])
         self.head = nn.Sequential(ConvBlock(WIDTH + fine, WIDTH), nn.Conv2d(WIDTH, dim, 1))
 
@@ -66,7 +67,7 @@ class Descriptor(nn.Module):
             unit.reshape(*batch, *unit.shape[1:]), context.reshape(*batch, *context.shape[1:])
         )
 
-    def _taps(self, maps: Features) -> tuple[Tensor, ...]:
+    def _taps(self, maps: Features | Channels) -> tuple[Any, ...]:
         """Of the pyramid, fine to coarse."""
         coarser = (maps.quarter, maps.eighth, maps.sixteenth)
         return (maps.half, *coarser) if self.stride == 2 else coarser

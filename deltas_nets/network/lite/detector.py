@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from deltas_geom.numerics.arithmetic import at_least_single
 from deltas_nets.config import DetectorConfig
-from deltas_nets.network.features import CHANNELS, Features
+from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
 
 CELL = 8
@@ -41,10 +41,10 @@ class FineLogits(nn.Module):
     convolutions, so what is learned at one place holds at all. Starts as no correction.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         self.convs = nn.Sequential(
-            ConvBlock(int(CHANNELS.fine), width),
+            ConvBlock(inputs, width),
             ConvBlock(width, width),
             ConvBlock(width, width),
             zero_initialised(nn.Conv2d(width, 4, 1)),
@@ -54,7 +54,7 @@ class FineLogits(nn.Module):
         """Corrections of the 65 logits; "none" has 0.
 
         Args:
-            fine: ``(B, 16, ceil(H/2), ceil(W/2))``.
+            fine: ``(B, inputs, ceil(H/2), ceil(W/2))``.
             like: ``(B, 65, h, w)`` the logits.
         """
         pixels = F.pixel_shuffle(at_least_single(self.convs(fine)), 2)
@@ -65,16 +65,22 @@ class FineLogits(nn.Module):
 
 
 class Detector(nn.Module):
-    """Head on the anchor's features, and the choice of N points."""
+    """Head on the anchor's features, and the choice of N points.
 
-    def __init__(self, config: DetectorConfig) -> None:
+    Args:
+        config: how many, how strong and how far apart.
+        channels: of the features.
+    """
+
+    def __init__(self, config: DetectorConfig, channels: Channels) -> None:
         super().__init__()
         self.config = config
-        self.coarse = ConvBlock(int(CHANNELS.sixteenth), 48, kernel=1)
+        self.coarse = ConvBlock(channels.sixteenth, 48, kernel=1)
         self.head = nn.Sequential(
-            ConvBlock(48 + int(CHANNELS.eighth), 64), nn.Conv2d(64, CELL * CELL + 1, 1)
+            ConvBlock(48 + channels.eighth, 64), nn.Conv2d(64, CELL * CELL + 1, 1)
         )
-        self.fine = FineLogits(config.fine_width) if config.fine_width else None
+        width = config.fine_width
+        self.fine = FineLogits(channels.fine, width) if width else None
 
     def forward(
         self,

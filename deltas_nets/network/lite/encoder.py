@@ -1,110 +1,43 @@
-"""Image encoder: the trunk of EfficientNet-Lite0, with taps at 1/2 to 1/16.
+"""What an encoder of `deltas-small`'s kind is: a pretrained trunk, and a branch of its own."""
 
-Source: Tan and Le, EfficientNet (2019); the Lite variant has no squeeze-and-excitation and
-uses ReLU6, so that it is fast and quantisable on CPUs. Module names are those of the public
-Apache-2.0 checkpoint, so that its file loads as it is.
-"""
-
-from pathlib import Path
+from typing import ClassVar
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from deltas_nets.errors import UserError
-from deltas_nets.network.conv_norm import SameConv, conv_norm
-from deltas_nets.network.features import Features
+from deltas_nets.network.encoder import ImageEncoder
+from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock
 
-# Expansion, kernel, stride, channels, repeats of the stages up to 1/16.
-_STAGES = (
-    (1, 3, 1, 16, 1),
-    (6, 3, 2, 24, 2),
-    (6, 5, 2, 40, 2),
-    (6, 3, 2, 80, 3),
-    (6, 5, 1, 112, 3),
-)
-_TAPS = (0, 2, 4, 10)  # the last block at each stride
 
+class LiteEncoder(ImageEncoder):
+    """RGB images in [0, 1], any size, to :class:`Features`.
 
-def _relu6(x: Tensor) -> Tensor:
-    return F.relu6(x, inplace=True)
+    A trunk derives from it, makes ``fine`` last, and gives ``taps``.
 
+    Attributes:
+        channels: of its maps.
+        fine: the branch that no public weights know, straight from the pixels.
+    """
 
-def _batch_norm(channels: int) -> nn.BatchNorm2d:
-    return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+    channels: ClassVar[Channels]
+    fine: ConvBlock
 
+    @classmethod
+    def fine_branch(cls) -> ConvBlock:
+        """A new ``fine``."""
+        return ConvBlock(3, cls.channels.fine, stride=2)
 
-class _InvertedResidual(nn.Module):
-    def __init__(self, inputs: int, outputs: int, expand: int, kernel: int, stride: int) -> None:
-        super().__init__()
-        width = inputs * expand
-        self.expands = expand != 1
-        self.residual = stride == 1 and inputs == outputs
-        if self.expands:
-            self._expand_conv = SameConv(inputs, width, 1, bias=False)
-            self._bn0 = _batch_norm(width)
-        self._depthwise_conv = SameConv(width, width, kernel, stride, groups=width, bias=False)
-        self._bn1 = _batch_norm(width)
-        self._project_conv = SameConv(width, outputs, 1, bias=False)
-        self._bn2 = _batch_norm(outputs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = _relu6(conv_norm(x, self._expand_conv, self._bn0)) if self.expands else x
-        y = _relu6(conv_norm(y, self._depthwise_conv, self._bn1))
-        y = conv_norm(y, self._project_conv, self._bn2)
-        output: Tensor = x + y if self.residual else y
-        return output
-
-
-class Encoder(nn.Module):
-    """RGB images in [0, 1], any size, to :class:`Features`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._conv_stem = SameConv(3, 32, 3, 2, bias=False)
-        self._bn0 = _batch_norm(32)
-        blocks: list[nn.Module] = []
-        channels = 32
-        for expand, kernel, stride, outputs, repeats in _STAGES:
-            for repeat in range(repeats):
-                step = stride if repeat == 0 else 1
-                blocks.append(_InvertedResidual(channels, outputs, expand, kernel, step))
-                channels = outputs
-        self._blocks = nn.ModuleList(blocks)
-        self.fine = ConvBlock(3, 16, stride=2)
+    def taps(self, images: Tensor) -> list[Tensor]:
+        """Maps of images ``(B * V, 3, H, W)`` at 1/2, 1/4, 1/8 and 1/16, rounded up."""
+        raise NotImplementedError
 
     def forward(self, images: Tensor) -> Features:
         """Encode ``(B, V, 3, H, W)``."""
-        batch = images.shape[:2]
         flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
-        # The mean and range that the pretrained weights were trained with.
-        x = _relu6(conv_norm((flat - 0.498) / 0.502, self._conv_stem, self._bn0))
-        taps = [self.fine(flat)]
-        for number, block in enumerate(self._blocks):
-            x = block(x)
-            if number in _TAPS:
-                taps.append(x)
-        return Features(*(tap.unflatten(0, batch) for tap in taps))
+        maps = [self.fine(flat), *self.taps(flat)]
+        return Features(*(each.unflatten(0, images.shape[:2]) for each in maps))
 
-    def load_pretrained(self, file: Path) -> None:
-        """Start from an EfficientNet-Lite0 classification checkpoint.
-
-        Raises:
-            UserError: the file is missing or holds something else.
-        """
-        try:
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        except FileNotFoundError:
-            raise UserError(
-                "no encoder weights", file, "name an EfficientNet-Lite0 checkpoint"
-            ) from None
-        own = {name for name in self.state_dict() if not name.startswith("fine.")}
-        missing = sorted(own - set(state))
-        if missing:
-            raise UserError(
-                f"not an EfficientNet-Lite0 checkpoint (no {missing[0]})",
-                file,
-                "name the file efficientnet-lite0-57934424.pth or one with its keys",
-            )
-        self.load_state_dict({name: state[name] for name in own}, strict=False)
+    def public_names(self) -> dict[str, str]:
+        """The trunk has the names of the public checkpoint."""
+        return {name: name for name in self.state_dict() if not name.startswith("fine.")}

@@ -6,7 +6,6 @@ authors need is in :mod:`deltas_nets.reference`.
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from deltas_geom import SparseDepth
 from deltas_geom.numerics.arithmetic import at_least_single
 from deltas_nets.config import DetectorConfig
-from deltas_nets.errors import UserError
+from deltas_nets.network.encoder import ImageEncoder
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.densifier import DenseDepth
 from deltas_nets.network.lite.descriptor import Descriptors
@@ -60,12 +59,13 @@ class ViewTaps(NamedTuple):
         return views[0]._replace(taps=together, num_views=len(views))
 
 
-class PaperEncoder(nn.Module):
+class PaperEncoder(ImageEncoder):
     """RGB images in [0, 1] to the backbone's taps."""
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
         self.backbone = backbone
+        self.origin = backbone.origin
 
     def forward(self, images: Tensor) -> ViewTaps:
         """Encode ``(B, V, 3, H, W)``."""
@@ -74,27 +74,9 @@ class PaperEncoder(nn.Module):
         size = (images.shape[-2], images.shape[-1])
         return ViewTaps(self.backbone(flat), images.shape[1], size)
 
-    def load_pretrained(self, file: Path) -> None:
-        """Start from a classification checkpoint of the same backbone; its classifier is left out.
-
-        Raises:
-            UserError: the file is missing or holds something else.
-        """
-        try:
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        except FileNotFoundError:
-            raise UserError("no encoder weights", file, "name a checkpoint") from None
-        own = self.backbone.state_dict()
-        missing = sorted(
-            name for name in own if name not in state or state[name].shape != own[name].shape
-        )
-        if missing:
-            raise UserError(
-                f"not a checkpoint of this backbone (no {missing[0]})",
-                file,
-                "name a ResNet-50 file with the common key names",
-            )
-        self.backbone.load_state_dict({name: state[name] for name in own})
+    def public_names(self) -> dict[str, str]:
+        """The backbone has the names of its public checkpoint."""
+        return {name: f"backbone.{name}" for name in self.backbone.state_dict()}
 
 
 class PaperDetector(nn.Module):

@@ -8,6 +8,7 @@ classifier, so that published weights load as they are.
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from deltas_nets.network.encoder import Origin
 from deltas_nets.network.paper.taps import Backbone, Taps, initialise_convolutions
 
 _EXPANSION = 4
@@ -26,6 +27,10 @@ class ResNet50(Backbone):
         >>> ResNet50().channels
         (64, 256, 512, 1024, 2048)
     """
+
+    origin = Origin(
+        "ResNet-50", "licence of the file's authors", "a ResNet-50 file with the common key names"
+    )
 
     def __init__(self, inputs: int = 3, width: int = 64) -> None:
         super().__init__()

@@ -4,10 +4,12 @@ Source: the paper, sections 3.1 and 3.3: the heads read the deepest map and fine
 densifier joins all five with those of the sparse depth.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+from deltas_nets.network.encoder import Origin
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -44,9 +46,11 @@ class Backbone(nn.Module):
 
     Attributes:
         channels: of its taps, half first.
+        origin: the public weights that it can start from.
     """
 
     channels: TapChannels
+    origin: ClassVar[Origin]
 
     def forward(self, images: Tensor) -> Taps:
         """Encode normalised images, or sparse depth in metres."""

@@ -19,6 +19,7 @@ SuperPoint (2018).
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from deltas_nets.network.encoder import Origin
 from deltas_nets.network.paper.taps import Backbone, Taps, initialise_convolutions
 
 
@@ -29,6 +30,8 @@ class VGG9(Backbone):
         inputs: channels of the image: 3, or 1 for sparse depth.
         width: channels of the first convolution: 64, or 16 for sparse depth.
     """
+
+    origin = Origin("VGG-9", "licence of the file's authors", "a file with the names of our VGG-9")
 
     def __init__(self, inputs: int = 3, width: int = 64) -> None:
         super().__init__()
