@@ -23,7 +23,7 @@ _HOMES = {
     "DepthPrediction": "deltas_nets.network.deltas",
     "NetworkConfig": "deltas_nets.config",
     "load_model": "deltas_nets.weights_file",
-    "open_capture": "deltas_nets.captures.capture",
+    "open_capture": "deltas_nets.captures.opening",
 }
 
 

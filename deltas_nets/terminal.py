@@ -1,27 +1,66 @@
 """What commands show besides their results, progress and warnings, and how they are stopped."""
 
 import contextlib
+import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+SECONDS_BETWEEN_LINES = 10.0
+"""Of progress, where it is not shown on a terminal."""
+READER_GONE = 141
+"""Exit status where nobody reads what is printed any more, as the shell has it for others."""
+
 
 def warn(text: str) -> None:
-    """One line on standard error, for what is not fatal."""
+    """Print one line on standard error, for what is not fatal."""
     print(f"deltas: warning: {text}", file=sys.stderr)
 
 
 @contextlib.contextmanager
 def progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A progress bar on standard output; the value is called for every finished frame."""
+    """Progress on standard output; the value is called for every finished frame.
+
+    A terminal gets a bar, which is gone when all is done; a pipe or a file gets a line every ten
+    seconds. An error is alone on its stream.
+    """
+    if not sys.stdout.isatty():
+        yield _lines(name, total)
+        return
     from rich.progress import Progress
 
-    # On standard output, and gone when done: an error is alone on its stream.
     with Progress(transient=True) as bar:
         task = bar.add_task(name, total=total)
         yield lambda _: bar.advance(task)
+
+
+def _lines(name: str, total: int) -> Callable[[str], None]:
+    """Tell of progress in lines: "depth: 12 of 186"."""
+    done, told = 0, time.monotonic()
+
+    def report(_: str) -> None:
+        nonlocal done, told
+        done += 1
+        if time.monotonic() - told >= SECONDS_BETWEEN_LINES:
+            print(f"{name}: {done} of {total}", flush=True)
+            told = time.monotonic()
+
+    return report
+
+
+@contextlib.contextmanager
+def silent_without_reader() -> Iterator[None]:
+    """End the program without a word where standard output is a pipe that nobody reads any more."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # What is left in the buffer is written when Python ends, and must not fail there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(READER_GONE)
 
 
 @contextlib.contextmanager

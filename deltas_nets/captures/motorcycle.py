@@ -10,7 +10,7 @@ import numpy as np
 import skimage.data
 from numpy.typing import NDArray
 
-from deltas_nets.captures.capture import Frame
+from deltas_nets.captures.frame import Frame
 from deltas_nets.errors import UserError
 
 FOCAL = 994.978  # px
@@ -24,7 +24,7 @@ SIZE = (500, 741)
 
 
 class StereoPair(NamedTuple):
-    """A posed pair and the true depth of its left image.
+    """Two views and the true depth of its left image.
 
     Attributes:
         left: the anchor; the world is its camera.

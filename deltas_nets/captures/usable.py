@@ -3,9 +3,16 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from deltas_nets.captures.capture import Capture, ids_in_words
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.view_choice import choose_view_sets
-from deltas_nets.captures.view_sets import ViewSet, check_frames, doubtful_scale, read_view_sets
+from deltas_nets.captures.view_sets import (
+    ViewSet,
+    check_frames,
+    doubtful_scale,
+    named_frames,
+    read_view_sets,
+)
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
@@ -43,9 +50,8 @@ def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[V
 def check_all(
     capture: Capture, view_sets: tuple[ViewSet, ...], *, with_depth: bool = False
 ) -> None:
-    """Decode everything that will be used, before anything is written."""
-    count = len({id for views in view_sets for id in (views.anchor, *views.sources)})
-    with progress("checking images", count) as report:
+    """Check every file that will be used, before anything is written."""
+    with progress("checking images", len(named_frames(view_sets))) as report:
         check_frames(capture, view_sets, with_depth=with_depth, report=report)
 
 
@@ -60,5 +66,4 @@ def warn_of(
         if doubt is not None:
             warn(doubt)
     if capture.lost and view_sets_file is None:
-        words = ids_in_words(sorted(capture.lost))
-        warn(f"frames without a usable pose are left out: {words}")
+        warn(f"frames without a usable pose are left out: {ids_in_words(capture.lost)}")

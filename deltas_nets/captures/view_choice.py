@@ -1,11 +1,13 @@
 """Which frames are looked at together, chosen by geometry where no file says it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deltas_nets.captures.capture import Capture, FloatArray, ids_in_words
+from deltas_nets.captures.capture import Capture, FloatArray
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.errors import UserError
 
@@ -31,7 +33,7 @@ def choose_view_sets(
     num_views: int,
     *,
     working_depth: float = 2.5,
-    anchors: Iterable[int] | None = None,
+    anchors: Iterable[str | int] | None = None,
 ) -> tuple[ViewSet, ...]:
     """Choose sources for every frame by baseline, viewing angle and overlap.
 
@@ -55,17 +57,16 @@ def choose_view_sets(
         raise UserError(what, capture.path, "depth from views needs two frames or more")
     ids = list(capture.frames)
     index_of = {id: index for index, id in enumerate(ids)}
-    wanted = ids if anchors is None else list(anchors)
-    for id in wanted:
-        capture.frame(id)
-    poses = np.stack([capture.frames[id].cam_from_world for id in ids])
+    wanted = ids if anchors is None else [capture.frame(id).id for id in anchors]
+    frames = capture.frames
+    poses = frames.cam_from_world
     centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
 
     view_sets = []
     for id in wanted:
         anchor = index_of[id]
         near = _candidates(centres, poses[:, 2, :3], anchor, working_depth)
-        overlap = _overlap(capture, ids, poses, anchor, near, working_depth)
+        overlap = _overlap(frames, anchor, near, working_depth)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
         angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
         log_score, acceptable = _rate(offsets, angles, overlap, working_depth)
@@ -115,33 +116,27 @@ def _baseline_log_score(baseline: FloatArray) -> FloatArray:
 
 
 def _overlap(
-    capture: Capture,
-    ids: Sequence[int],
-    poses: FloatArray,
-    anchor: int,
-    near: NDArray[np.intp],
-    working_depth: float,
+    frames: Frames, anchor: int, near: NDArray[np.intp], working_depth: float
 ) -> FloatArray:
     """Part of the anchor's image that each candidate sees, over the probed depths, (C,)."""
-    frame = capture.frames[ids[anchor]]
-    height, width = frame.image_size
+    height, width = frames.image_sizes[anchor]
     parts = (np.arange(PROBES_ACROSS) + 0.5) / PROBES_ACROSS
     x, y = np.meshgrid(parts * width - 0.5, parts * height - 0.5)
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    rays = np.linalg.inv(frame.K) @ pixels
+    rays = np.linalg.inv(frames.K[anchor]) @ pixels
     points = np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
 
+    poses = frames.cam_from_world
     rotation, shift = poses[anchor, :3, :3], poses[anchor, :3, 3:]
-    others = [capture.frames[ids[index]] for index in near]
     # Relative poses first: with the world's origin kilometres away the sums would cancel.
     turns = poses[near, :3, :3] @ rotation.T
     seen = turns @ points + (poses[near, :3, 3:] - turns @ shift)
-    projected = np.stack([other.K for other in others]) @ seen
+    projected = frames.K[near] @ seen
     depth = projected[:, 2]
     in_front = depth > 0.1
     safe = np.where(in_front, depth, 1.0)
     column, row = projected[:, 0] / safe, projected[:, 1] / safe
-    sizes = np.array([other.image_size for other in others], dtype=np.float64)
+    sizes = frames.image_sizes[near].astype(np.float64)
     inside = (np.abs(column - (sizes[:, 1:] - 1) / 2) <= sizes[:, 1:] / 2) & (
         np.abs(row - (sizes[:, :1] - 1) / 2) <= sizes[:, :1] / 2
     )

@@ -7,25 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deltas_nets.captures.capture import Capture, ids_in_words
+from deltas_nets.captures.capture import Capture
 from deltas_nets.errors import UserError
 
-__all__ = ["ViewSet", "check_frames", "doubtful_scale", "read_view_sets"]
+__all__ = ["ViewSet", "check_frames", "doubtful_scale", "named_frames", "read_view_sets"]
 
 
 class ViewSet(NamedTuple):
     """Ids of frames that are looked at together."""
 
-    anchor: int
+    anchor: str
     """The frame whose depth is wanted."""
-    sources: tuple[int, ...]
+    sources: tuple[str, ...]
     """The frames that help, best first."""
 
 
 def read_view_sets(
     path: str | Path, capture: Capture, *, allow_no_sources: bool = False
 ) -> tuple[ViewSet, ...]:
-    """Read ``[{"anchor": 10, "sources": [8, 12]}, ...]``.
+    """Read ``[{"anchor": 10, "sources": [8, 12]}, ...]``; ids may be numbers or strings.
 
     Args:
         path: the JSON file.
@@ -49,17 +49,19 @@ def read_view_sets(
     if not entries:
         raise UserError("the list of view sets is empty", path, form)
 
-    sets: dict[int, ViewSet] = {}
+    sets: dict[str, ViewSet] = {}
     for position, entry in enumerate(entries):
         name = f"view set {position + 1} of {len(entries)}"
         if not isinstance(entry, dict) or not entry.keys() >= {"anchor", "sources"}:
             raise UserError(f"{name} is not an object with anchor and sources", path, form)
-        anchor, sources = entry["anchor"], entry["sources"]
-        if not _is_id(anchor):
-            raise UserError(f"{name} has anchor {anchor!r}, not a frame number", path, form)
-        if not isinstance(sources, list) or not all(_is_id(source) for source in sources):
-            what = f"{name} (anchor {anchor}) has sources that are no list of frame numbers"
+        if not _is_id(entry["anchor"]):
+            what = f"{name} has anchor {entry['anchor']!r}, not the id of a frame"
             raise UserError(what, path, form)
+        anchor, sources = str(entry["anchor"]), entry["sources"]
+        if not isinstance(sources, list) or not all(map(_is_id, sources)):
+            what = f"{name} (anchor {anchor}) has sources that are no list of ids"
+            raise UserError(what, path, form)
+        sources = [str(source) for source in sources]
         _check_ids(name, anchor, sources, path=path, capture=capture)
         if not sources and not allow_no_sources:
             what = f"{name} (anchor {anchor}) has no sources"
@@ -80,6 +82,8 @@ def check_frames(
 ) -> None:
     """Check every frame that a set names, before anything is computed or written.
 
+    A file is decoded only where nothing less tells that it is whole.
+
     Args:
         capture: the frames.
         view_sets: what will be used of them.
@@ -90,25 +94,30 @@ def check_frames(
         UserError: a frame is missing, its pose is not finite, or its image or depth does not
             decode to the end; the text names the file.
     """
-    named = dict.fromkeys(id for view_set in view_sets for id in (view_set[0], *view_set[1]))
-    for id in named:
+    for id in named_frames(view_sets):
         frame = capture.frame(id)
         if not np.isfinite(frame.cam_from_world).all():
             remedy = "take the frame out of the view sets"
             raise UserError(f"the pose of frame {id} is not finite", frame.image_path, remedy)
-        frame.read_image()
-        report(str(id))
+        frame.check_image()
+        report(id)
     if with_depth:
         for view_set in view_sets:
-            capture.frame(view_set.anchor).read_depth()
+            capture.frame(view_set.anchor).check_depth()
+
+
+def named_frames(view_sets: Sequence[ViewSet]) -> list[str]:
+    """Every id that the sets name, once, in their order."""
+    return list(dict.fromkeys(id for views in view_sets for id in (views.anchor, *views.sources)))
 
 
 def _is_id(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return whole or (isinstance(value, str) and value != "")
 
 
 def _check_ids(
-    name: str, anchor: int, sources: Sequence[int], *, path: Path, capture: Capture
+    name: str, anchor: str, sources: Sequence[str], *, path: Path, capture: Capture
 ) -> None:
     if anchor in sources:
         what = f"{name} has its anchor {anchor} among its own sources"
@@ -118,12 +127,10 @@ def _check_ids(
         raise UserError(what, path, "name each source once")
     for id in (anchor, *sources):
         if id in capture.lost:
-            raise capture.lost[id]
+            raise capture.lost[id].error
         if id not in capture.frames:
-            nearest = sorted(capture.frames, key=lambda other: (abs(other - id), other))[:4]
             what = f"{name} names frame {id}, which {capture.path} does not have"
-            remedy = f"use its frames; the nearest are {ids_in_words(sorted(nearest))}"
-            raise UserError(what, path, remedy)
+            raise UserError(what, path, capture.instead_of(id))
 
 
 def doubtful_scale(
@@ -136,8 +143,9 @@ def doubtful_scale(
         view_sets: that are used.
         depth_range: (near, far) of the search, metres.
     """
-    used = {id for views in view_sets for id in (views.anchor, *views.sources)}
-    centres = {id: np.linalg.inv(capture.frame(id).cam_from_world)[:3, 3] for id in used}
+    centres = {
+        id: np.linalg.inv(capture.frame(id).cam_from_world)[:3, 3] for id in named_frames(view_sets)
+    }
     baselines = [
         float(np.linalg.norm(centres[source] - centres[views.anchor]))
         for views in view_sets

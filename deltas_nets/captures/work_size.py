@@ -10,7 +10,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_geom.cameras.views import PosedViews
-from deltas_nets.captures.capture import FloatArray, Frame
+from deltas_nets.captures.frame import FloatArray, Frame
 
 __all__ = [
     "anchor_views",

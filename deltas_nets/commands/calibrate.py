@@ -6,12 +6,13 @@ from typing import Annotated
 
 import tyro
 
+from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
 from deltas_nets.errors import UserError
 
 
 @dataclass(frozen=True)
-class Calibrate:
+class Calibrate(Command):
     """Make the standard deviations that weights predict as large as their errors.
 
     Fits curves of eight points, one each for 2, 3, 5 and 8 views, on procedural rooms that no
@@ -43,7 +44,7 @@ class Calibrate:
     """Show the traceback of an error."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from rich.console import Console
 
         from deltas_nets.commands.flags import usable_device

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import CONFIGS
 
@@ -13,7 +14,7 @@ Measured = Literal[Network, "reference"]
 
 
 @dataclass(frozen=True)
-class Cost:
+class Cost(Command):
     """Parameters, multiply-accumulates and time of a network by stage, beside the paper's.
 
     Example: deltas cost deltas-small --views 3
@@ -38,7 +39,7 @@ class Cost:
     """Show the traceback of an error."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.cost.command import run_cost
         from deltas_nets.network.deltas import Deltas

@@ -23,7 +23,7 @@ class Demo(Prediction):
     """Write into a folder that holds other things."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from deltas_nets.network.deltas import Deltas
         from deltas_nets.predict.demo import run_demo
 

@@ -1,14 +1,14 @@
 """The command `deltas depth`."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.commands.flags import Flag, Prediction
+from deltas_nets.commands.flags import Flag, Prediction, sensible
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
@@ -49,6 +49,8 @@ class Depth(Prediction):
     given."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Views per depth map, the anchor included; all of the view sets', or 5, if not given."""
+    depth_scale: float = 1000.0
+    """Steps of depth/N.png in a metre: 1000 are millimetres, up to 65.5 m; 100 reach 655 m."""
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
     """Size of the maps; the colour image's if not given."""
     min_confidence: float = 0.0
@@ -58,27 +60,34 @@ class Depth(Prediction):
     overwrite: Flag = False
     """Start again instead of continuing, or write into a folder that holds other things."""
 
+    going_on = "the same command goes on"
+
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         import torch
 
+        from deltas_nets.captures.ids import id_in_json
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.usable import check_all, usable_view_sets, warn_of
-        from deltas_nets.commands.depth import read_shard
         from deltas_nets.outputs.folder import prepare_output
+        from deltas_nets.outputs.products import MILLIMETRES, OutputOptions, check_depth_fits
+        from deltas_nets.outputs.summary import SCALE, SUMMARY, read_summary, view_sets_in_json
         from deltas_nets.predict.capture import predict_capture
         from deltas_nets.predict.ours import check_asked, states_confidence
         from deltas_nets.predict.predictor import file_record, network_record
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
-        capture = open_capture(self.capture)
+        options = sensible(OutputOptions, depth_scale=self.depth_scale)
+        check_depth_fits(self.depth_range, options)
+        capture = open_capture(self.capture).remembering()
         view_sets = usable_view_sets(capture, self.view_sets, self.views)
         check_all(capture, view_sets)
         warn_of(capture, view_sets, self.view_sets, self.depth_range)
         network = self.network()
         check_asked(network, config, capture, view_sets)
         mine = view_sets[shard[0] - 1 :: shard[1]]
+        scale = {} if self.depth_scale == MILLIMETRES else {SCALE: self.depth_scale}
         folder = prepare_output(
             self.out,
             settings={
@@ -88,16 +97,17 @@ class Depth(Prediction):
                 "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
                 "precision": self.precision,
                 "views": self.views,
-                "view_sets": view_sets,
+                "view_sets": view_sets_in_json(view_sets),
+                **scale,
             },
             overwrite=self.overwrite,
             forbidden=capture.path,
             shard=shard,
             frame_ids=[views.anchor for views in mine],
-            confidence=states_confidence(network),
+            options=replace(options, confidence=states_confidence(network)),
             head={
                 "versions": {"deltas-depth": __version__, "torch": torch.__version__},
-                "lost_poses": sorted(capture.lost),
+                "lost_poses": list(map(id_in_json, capture.lost)),
             },
         )
         with progress("depth", len(mine)) as report:
@@ -108,3 +118,13 @@ class Depth(Prediction):
             print("no confidence is written: the published network states none")
         if counts.blind:
             warn(f"{counts.blind} maps without a triangulated point are guesses: see summary.json")
+        saturated = sum("saturated_pixels" in record for record in folder.frames.values())
+        if saturated:
+            most = f"{options.max_depth:g} m"
+            warn(
+                f"{saturated} maps have depth beyond {most} that is written as {most}: add "
+                f"--depth-scale {self.depth_scale / 10:g}; see summary.json"
+            )
+        waiting = (read_summary(self.out / SUMMARY) or {}).get("waiting_for", ())
+        if waiting:
+            print(f"the folder is complete after --shard {', '.join(waiting)}")

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
+from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
 from deltas_nets.config.distill import DistillConfig
 
 
 @dataclass(frozen=True)
-class Distill(DistillConfig):
+class Distill(DistillConfig, Command):
     """Teach the detector of weights to find another detector's points, or its own more steadily.
 
     Nothing else of the network changes. The teacher looks at every picture of a pool from several
@@ -26,7 +27,7 @@ class Distill(DistillConfig):
     """Show the traceback of an error."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.distill.training import distill
         from deltas_nets.terminal import progress

@@ -43,7 +43,7 @@ class Evaluate(Prediction):
     """Also write the scores to this file."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from rich.console import Console
 
         from deltas_nets.evaluate.report import (
@@ -88,7 +88,7 @@ class Evaluate(Prediction):
         from deltas_nets.predict.ours import check_asked
 
         config = self.config()
-        capture = open_capture(path)
+        capture = open_capture(path).remembering()
         if self.predictions is not None and self.view_sets is None:
             view_sets = recorded_view_sets(self.predictions)
         else:

@@ -6,12 +6,13 @@ from typing import Annotated
 
 import tyro
 
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.command import Command
+from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.errors import UserError
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Command):
     """Write the whole network as one file: .onnx for onnxruntime, .pt2 for torch.export.load.
 
     Inputs are images (1, V, 3, H, W) in [0, 1], K (1, V, 3, 3) and cam_from_world (1, V, 4, 4);
@@ -43,7 +44,7 @@ class Export:
     """Show the traceback of an error."""
 
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from deltas_nets.export import ExportConfig, export_onnx, export_program
         from deltas_nets.network.deltas import Deltas
         from deltas_nets.outputs.atomic_files import check_writable
@@ -55,12 +56,14 @@ class Export:
             raise UserError("the suffix is the format", f"--out {self.out}", "use .onnx or .pt2")
         if self.out.exists() and not self.overwrite:
             raise UserError("the file exists", self.out, "add --overwrite or name another")
-        try:
-            config = ExportConfig(
-                self.views, self.points, self.size, self.depth_range, self.refinement
-            )
-        except ValueError as error:
-            raise UserError(str(error), "command line", "see deltas export --help") from None
+        config = sensible(
+            ExportConfig,
+            num_views=self.views,
+            num_points=self.points,
+            image_size=self.size,
+            depth_range=self.depth_range,
+            refinement=self.refinement,
+        )
         check_writable(self.out.parent)
         network = load_network(self.weights)
         if not isinstance(network, Deltas):

@@ -1,10 +1,12 @@
 """Flags that several commands share."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
+from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
 if TYPE_CHECKING:
@@ -12,14 +14,16 @@ if TYPE_CHECKING:
     from deltas_nets.predict.predictor import AnyNetwork
 
 
+T = TypeVar("T")
+
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Network = Literal["deltas-small", "deltas-resnet50", "deltas-vgg9"]
 NETWORKS: tuple[Network, ...] = ("deltas-small", "deltas-resnet50", "deltas-vgg9")
 
 
 @dataclass(frozen=True)
-class Prediction:
-    """Flags of every command that predicts."""
+class Prediction(Command):
+    """A command that predicts: flags that all of them have."""
 
     weights: str = "deltas-small"
     """A shipped network, a weights file of `deltas train`, or the checkpoint that the paper's
@@ -53,10 +57,20 @@ class Prediction:
         """The flags as a config, with nonsense refused."""
         from deltas_nets.predict.depth_map import PredictConfig
 
-        try:
-            return PredictConfig(depth_range=self.depth_range, work_size=self.work_size, **more)
-        except ValueError as error:
-            raise UserError(str(error), "command line", "see --help of this command") from None
+        fields = {"depth_range": self.depth_range, "work_size": self.work_size, **more}
+        return sensible(PredictConfig, **fields)
+
+
+def sensible(config: Callable[..., T], **fields: Any) -> T:
+    """A config of some flags, with nonsense refused in the config's own words.
+
+    Raises:
+        UserError: the config raises ValueError.
+    """
+    try:
+        return config(**fields)
+    except ValueError as error:
+        raise UserError(str(error), "command line", "see --help of this command") from None
 
 
 def usable_device(name: str) -> str:

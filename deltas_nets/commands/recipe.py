@@ -7,13 +7,14 @@ from typing import Annotated
 
 import tyro
 
+from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
 from deltas_nets.config.recipes import RECIPES, RecipeName
 from deltas_nets.errors import UserError
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(Command):
     """Train deltas-small from scratch to calibrated weights, as one command.
 
     night is for two CPU cores: small rooms, then large ones. hour is for a GPU and a dozen cores.
@@ -41,8 +42,10 @@ class Recipe:
     debug: Flag = False
     """Show the traceback of an error."""
 
+    going_on = "the same command goes on"
+
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         import torch
 
         from deltas_nets.commands.calibrate import Calibrate

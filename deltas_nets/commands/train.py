@@ -1,21 +1,23 @@
 """The command `deltas train`."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
+from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
 from deltas_nets.errors import UserError
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(Command):
     """Train a network on procedural rooms, or on scenes in ScanNet's layout (--data scannet).
 
     Writes config.json, checkpoint.pt, weights.safetensors, log.jsonl and TensorBoard's curves into
@@ -55,8 +57,17 @@ class Train:
     debug: Flag = False
     """Show the traceback of an error."""
 
+    going_on = "the same command with --resume goes on"
+
+    @classmethod
+    def parsed_as(cls, arguments: Sequence[str]) -> Any:
+        """The flags' defaults are those of the network that --config names."""
+        preset = preset_of(arguments)
+        default = cls(out=Path("runs") / preset, preset=preset, config=TRAIN_CONFIGS[preset])
+        return Annotated[cls, tyro.conf.subcommand(name="train", default=default)]
+
     def run(self) -> None:
-        """Do it."""
+        """Run the command."""
         from deltas_nets.outputs.atomic_files import check_writable
         from deltas_nets.train.fit import fit
         from deltas_nets.train.resume import resumed_config
@@ -104,7 +115,7 @@ class Train:
                 raise UserError("too few steps", option, f"give {least} or more")
 
 
-def preset_of(arguments: list[str]) -> Network:
+def preset_of(arguments: Sequence[str]) -> Network:
     """What --config names: the defaults of the other flags depend on it."""
     for word, following in pairwise([*arguments, ""]):
         name = word.partition("=")[2] if word.startswith("--config=") else following

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +11,21 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from deltas_nets.datasets.scenes import LeftOut, Scene, read_scene
+from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.frames import Camera, FrameArrays, Frames
+from deltas_nets.datasets.scenes import read_scene
+from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_atomically
 
 __all__ = ["read_scene_cached"]
 
-VERSION = 2
+VERSION = 3
 """Raised whenever the same files give another scene."""
+WORDS = ("ids", "images", "depths")
 
 
-def read_scene_cached(path: Path, cache: Path | None) -> Scene:
+def read_scene_cached(path: Path, cache: Path | None) -> Capture:
     """:func:`read_scene`, or what it found the last time.
 
     Args:
@@ -61,27 +65,26 @@ def _state(path: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def _save(file: Path, scene: Scene) -> None:
+def _save(file: Path, scene: Capture) -> None:
+    arrays = scene.frames.arrays
     tensors: dict[str, NDArray[Any]] = {
-        "K": scene.K,
-        "ids": scene.ids,
-        "cam_from_world": scene.cam_from_world,
+        "cam_from_world": arrays.cam_from_world,
+        "camera_of": arrays.camera_of,
     }
-    if scene.depth_K is not None:
-        tensors["depth_K"] = scene.depth_K
-    for name, words in (("images", scene.images), ("depths", scene.depths)):
+    for name in WORDS:
+        words = getattr(arrays, name)
         tensors[name] = words.view(np.uint8).reshape(len(words), words.itemsize)
+    lost = [(id, why.reason, *why.error.args) for id, why in scene.lost.items()]
     metadata = {
-        "image_size": json.dumps(scene.image_size),
-        "depth_size": json.dumps(scene.depth_size),
-        "left_out": json.dumps(asdict(scene.left_out)),
+        "cameras": json.dumps([camera._asdict() for camera in arrays.cameras], default=_plain),
+        "lost": json.dumps(lost, default=str),
         "doubts": json.dumps(scene.doubts),
     }
     content = save({name: np.ascontiguousarray(t) for name, t in tensors.items()}, metadata)
     write_atomically(file, lambda opened: opened.write(content))
 
 
-def _load(file: Path, path: Path) -> Scene | None:
+def _load(file: Path, path: Path) -> Capture | None:
     """None where the file is damaged: it is written again."""
     try:
         with safe_open(str(file), framework="np") as opened:
@@ -89,23 +92,34 @@ def _load(file: Path, path: Path) -> Scene | None:
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (SafetensorError, OSError):
         return None
-    height, width = json.loads(metadata["image_size"])
-    depth_size = json.loads(metadata["depth_size"])
-
-    def words(name: str) -> NDArray[np.bytes_]:
+    for name in WORDS:
         letters = np.ascontiguousarray(tensors[name])
-        return letters.view(f"S{letters.shape[1]}").reshape(-1)
+        tensors[name] = letters.view(f"S{letters.shape[1]}").reshape(-1)
+    cameras = tuple(_camera(**fields) for fields in json.loads(metadata["cameras"]))
+    lost = {
+        id: Lost(reason, UserError(what, Path(where), remedy))
+        for id, reason, what, where, remedy in json.loads(metadata["lost"])
+    }
+    frames = Frames(path, FrameArrays(**tensors, cameras=cameras))
+    return Capture(path, frames, lost, tuple(json.loads(metadata["doubts"])))
 
-    return Scene(
-        path=path,
-        image_size=(height, width),
-        K=tensors["K"],
-        depth_K=tensors.get("depth_K"),
+
+def _camera(
+    image_size: list[int],
+    K: list[list[float]],
+    depth_K: list[list[float]] | None,
+    depth_size: list[int] | None,
+    lens: list[Any] | None,
+) -> Camera:
+    return Camera(
+        image_size=(image_size[0], image_size[1]),
+        K=np.array(K),
+        depth_K=None if depth_K is None else np.array(depth_K),
         depth_size=None if depth_size is None else (depth_size[0], depth_size[1]),
-        ids=tensors["ids"],
-        cam_from_world=tensors["cam_from_world"],
-        images=words("images"),
-        depths=words("depths"),
-        left_out=LeftOut(**json.loads(metadata["left_out"])),
-        doubts=tuple(json.loads(metadata["doubts"])),
+        lens=None if lens is None else Lens(lens[0], tuple(lens[1])),
     )
+
+
+def _plain(matrix: NDArray[np.float64]) -> object:
+    # Python writes as many digits as tell a number from all others.
+    return matrix.tolist()

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from deltas_nets.captures.capture import ids_in_words
+from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.readers.scannet import NESTING, is_scene
 from deltas_nets.captures.text_lines import read_lines
 from deltas_nets.errors import UserError

@@ -19,6 +19,7 @@ from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
 from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.products import read_depth_png
+from deltas_nets.outputs.summary import recorded_depth_scale
 from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, keypoint_depths
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import predict_frame, predict_map, remembering
@@ -111,10 +112,11 @@ def evaluate_files(
         UserError: a map is missing or cannot be read.
     """
     scores: dict[str, MapScores | None] = {}
+    scale = recorded_depth_scale(predictions)
     for views in view_sets:
         file = predictions / "depth" / f"{views.anchor}.png"
         try:
-            predicted = read_depth_png(file)
+            predicted = read_depth_png(file, scale=scale)
         except OSError as error:
             raise UserError(
                 f"no depth map ({error.strerror or error})", file, "run deltas depth first"

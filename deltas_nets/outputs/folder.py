@@ -1,21 +1,21 @@
 """The folder that the depth command fills: safe to kill, continue, share and refuse.
 
 Files in it are whole (`deltas_nets.outputs.atomic_files`), so a frame whose files all exist is
-finished, whenever the run before was killed. Where the network states no confidence there is no
-folder confidence. summary.json says what made the files: written at the start (status
-``running``) and at the end (``complete``); what it does not hold yet is in
-`deltas_nets.outputs.frame_records`. Several shards may fill one folder; each keeps its own
-summary.I-of-N.json beside the summary of all.
+finished, whenever the run before was killed. Which files those are is a table in
+`deltas_nets.outputs.products`. summary.json says what made them: it is written at the start (status
+``running``) and at the end (``complete``, or ``stopped`` where frames are missing and no run is at
+work); what it does not hold yet is in a journal (`deltas_nets.outputs.journal`). Several shards may
+fill one folder; each keeps its own summary.I-of-N.json beside the summary of all, which names those
+that it is ``waiting_for`` when none is running.
 """
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import ArrayLike
-
+from deltas_nets.captures.ids import id_in_json
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import (
     TEMPORARY,
@@ -24,12 +24,15 @@ from deltas_nets.outputs.atomic_files import (
     plain,
     write_json,
 )
-from deltas_nets.outputs.frame_records import FrameRecords, read_records, remove_records
+from deltas_nets.outputs.journal import Journal, read_journals, remove_journals
 from deltas_nets.outputs.products import (
-    write_confidence_png,
-    write_depth_png,
-    write_points_ply,
+    PRODUCTS,
+    FrameOutput,
+    OutputOptions,
+    products_of,
+    remarks_on,
 )
+from deltas_nets.outputs.shards import write_shard_summary
 from deltas_nets.outputs.summary import (
     SHARD_SUMMARY,
     SUMMARY,
@@ -41,10 +44,6 @@ from deltas_nets.outputs.summary import (
 
 __all__ = ["OutputFolder", "prepare_output"]
 
-KINDS = {"depth": ".png", "confidence": ".png", "points": ".ply"}
-
-FrameId = int | str
-
 
 class OutputFolder:
     """A folder being filled by one run; made by `prepare_output`."""
@@ -53,118 +52,77 @@ class OutputFolder:
         self,
         path: Path,
         *,
-        kinds: Sequence[str],
+        options: OutputOptions,
         head: dict[str, Any],
         frames: dict[str, Any],
         shard: tuple[int, int],
     ) -> None:
         self.path = path
-        self.kinds = kinds
+        self.products = products_of(options)
+        self.frames = frames
+        """Records of this run and of those it continues, by id."""
+        self._options = options
         self._head = head
-        self._frames = frames  # records of this run and of those it continues, by id
         self._shard = shard
         own = path / SUMMARY if shard[1] == 1 else shard_summary(path, shard)
-        self._records = FrameRecords(own)
+        self._journal = Journal(own)
 
-    def file(self, kind: str, id: FrameId) -> Path:
-        """Where a frame's ``depth``, ``confidence`` or ``points`` are written."""
-        return _file(self.path, kind, id)
+    def file(self, product: str, id: str) -> Path:
+        """Where a product of a frame is written."""
+        return next(row for row in self.products if row.name == product).file(self.path, id)
 
-    def is_finished(self, id: FrameId) -> bool:
+    def is_finished(self, id: str) -> bool:
         """Whether all files of a frame exist, and therefore are complete."""
-        return all(self.file(kind, id).exists() for kind in self.kinds)
+        return all(product.file(self.path, id).exists() for product in self.products)
 
-    def write_frame(
-        self,
-        id: FrameId,
-        *,
-        depth: ArrayLike,
-        probability: ArrayLike | None,
-        points: ArrayLike,
-        colors: ArrayLike,
-        record: Mapping[str, Any],
-    ) -> None:
-        """Write a frame's files; ``record`` (status, times) goes to the summary.
+    def write_frame(self, frame: FrameOutput, record: Mapping[str, Any]) -> None:
+        """Write a frame's files.
 
         Args:
-            id: of the frame.
-            depth: ``(H, W)`` metres.
-            probability: ``(H, W)`` in [0, 1]; None where the folder holds no confidence.
-            points: ``(N, 3)`` metres.
-            colors: ``(N, 3)`` uint8.
-            record: goes to the summary.
+            frame: what is known of it; with a confidence where the folder's options say so.
+            record: status and times, for the summary.
 
         Raises:
-            ValueError: a probability is missing, or there is one too many.
+            ValueError: a confidence is missing, or there is one too many.
         """
-        if (probability is not None) != ("confidence" in self.kinds):
-            raise ValueError(f"the folder holds {', '.join(self.kinds)}")
+        if (frame.confidence is not None) != self._options.confidence:
+            raise ValueError(f"the folder's options are {self._options}")
+        id, record = frame.anchor.id, {**record, **remarks_on(frame, self._options)}
         # First: a frame is finished with the last of its files, and then it has a record.
-        self._records.add(id, record)
-        write_points_ply(self.file("points", id), points, colors)
-        if probability is not None:
-            write_confidence_png(self.file("confidence", id), probability)
-        write_depth_png(self.file("depth", id), depth)
-        self._frames[str(id)] = dict(record)
+        self._journal.add(id, record)
+        for product in reversed(self.products):
+            product.write(product.file(self.path, id), frame, self._options)
+        self.frames[id] = record
 
-    def keep_frame(self, id: FrameId) -> None:
+    def keep_frame(self, id: str) -> None:
         """Count a frame that an earlier run finished; its record is kept where it had one."""
-        self._frames.setdefault(str(id), {"status": "kept"})
+        self.frames.setdefault(id, {"status": "kept"})
 
-    def recover(self, ids: Iterable[FrameId] | None) -> None:
-        """Take over what killed runs had recorded of frames they finished; of these, if not all."""
-        wanted = None if ids is None else set(map(str, ids))
-        for id, record in read_records(self.path).items():
+    def recover(self, ids: Iterable[str] | None) -> None:
+        """Take over what killed runs had recorded of the frames that they finished.
+
+        Args:
+            ids: the frames that count; None for all.
+        """
+        wanted = None if ids is None else set(ids)
+        for id, record in read_journals(self.path).items():
             if self.is_finished(id) and (wanted is None or id in wanted):
-                self._frames[id] = record
+                self.frames[id] = record
 
     def write_summary(self, status: str, **more: Any) -> None:
         """Write the summary: ``running`` at the start and in between, then how it ended.
 
         Args:
-            status: ``running``, ``stopped`` or ``complete``.
+            status: of this run: ``running``, ``stopped`` or ``complete``.
             more: goes to the summary beside the settings (times, counts).
         """
         self._head = self._head | more
-        content = self._head | {"status": status, "frames": self._frames}
+        content = self._head | {"status": status, "frames": self.frames}
         if self._shard[1] > 1:
-            self._write_shard_summary(content)
+            write_shard_summary(self.path, self._shard, content)
         else:
             write_json(self.path / SUMMARY, content)
-        self._records.remove()
-
-    def _write_shard_summary(self, content: dict[str, Any]) -> None:
-        write_json(shard_summary(self.path, self._shard), content)
-        # Others may finish between our reading and our writing. Who writes last reads once
-        # more, so the summary that stays has seen everything.
-        parts = self._parts()
-        while True:
-            write_json(self.path / SUMMARY, self._merged(content, parts))
-            seen, parts = parts, self._parts()
-            if seen == parts:
-                return
-
-    def _parts(self) -> list[dict[str, Any]]:
-        """Summaries of the shards that work with our settings."""
-        count = self._shard[1]
-        paths = [shard_summary(self.path, (index, count)) for index in range(1, count + 1)]
-        parts = [part for path in paths if (part := read_summary(path)) is not None]
-        return [part for part in parts if part["settings"] == self._head["settings"]]
-
-    def _merged(self, own: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, Any]:
-        earlier = read_summary(self.path / SUMMARY)
-        frames: dict[str, Any] = {}
-        if earlier is not None and earlier["settings"] == self._head["settings"]:
-            frames |= earlier["frames"]
-        for part in parts:
-            frames |= part["frames"]
-        statuses = [part["status"] for part in parts]
-        if statuses == ["complete"] * self._shard[1]:
-            status = "complete"
-        else:
-            stopped = "stopped" in statuses and "running" not in statuses
-            status = "stopped" if stopped else "running"
-        return own | {"status": status, "frames": frames}
+        self._journal.remove()
 
 
 def prepare_output(
@@ -174,8 +132,8 @@ def prepare_output(
     overwrite: bool = False,
     forbidden: Path | None = None,
     shard: tuple[int, int] = (1, 1),
-    frame_ids: Iterable[FrameId] = (),
-    confidence: bool = True,
+    frame_ids: Iterable[str] = (),
+    options: OutputOptions = OutputOptions(),  # noqa: B008
     head: Mapping[str, Any] | None = None,
 ) -> OutputFolder:
     """Make or continue a folder for outputs, and write its summary with status ``running``.
@@ -189,7 +147,7 @@ def prepare_output(
         forbidden: the capture. Its own depth/ would be overwritten, so it is never an output.
         shard: which of how many runs that fill the folder this is, from 1.
         frame_ids: the frames of this run: what ``overwrite`` removes where others work too.
-        confidence: whether maps of it are written, too.
+        options: what all frames have in common.
         head: goes to the summary beside the settings (versions, counts of lost frames).
 
     Returns:
@@ -200,7 +158,6 @@ def prepare_output(
             settings. Nothing in it has been changed then.
     """
     out, frame_ids = Path(out), list(frame_ids)
-    kinds = [kind for kind in KINDS if confidence or kind != "confidence"]
     wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
     if forbidden is not None and out.resolve() == forbidden.resolve():
         what = "the output folder is the capture itself"
@@ -225,14 +182,14 @@ def prepare_output(
     frames = {} if own is None else dict(own["frames"])
     folder = OutputFolder(
         out,
-        kinds=kinds,
+        options=options,
         head={
             "writer": WRITER,
             "status": "running",
             **(head or {}),
-            "files": kinds,
+            "files": [product.name for product in products_of(options)],
             "settings": wanted,
-            "anchors": frame_ids,
+            "anchors": list(map(id_in_json, frame_ids)),
         },
         frames={} if overwrite else frames,
         shard=shard,
@@ -243,7 +200,7 @@ def prepare_output(
         # Before the new summary: killed in between, the old one still says what made the rest.
         out.mkdir(parents=True, exist_ok=True)
         if overwrite:
-            planned = {id for summary in earlier for id in summary.get("anchors", ())}
+            planned = {str(id) for summary in earlier for id in summary.get("anchors", ())}
             _remove_frames(out, {*frame_ids, *(planned if shard[1] == 1 else ())})
             if shard[1] == 1:
                 _remove_shard_summaries(out)
@@ -251,23 +208,19 @@ def prepare_output(
             _remove_temporary(out)
         folder.write_summary("running")
         if shard[1] == 1:
-            remove_records(out)
-        for kind in kinds:
-            (out / kind).mkdir(exist_ok=True)
+            remove_journals(out)
+        for product in folder.products:
+            (out / product.name).mkdir(exist_ok=True)
     except OSError as error:
         raise cannot_write(Path(error.filename or out), error) from error
     return folder
 
 
-def _file(out: Path, kind: str, id: FrameId) -> Path:
-    return out / kind / f"{id}{KINDS[kind]}"
-
-
-def _remove_frames(out: Path, ids: Iterable[FrameId]) -> None:
+def _remove_frames(out: Path, ids: Iterable[str]) -> None:
     """Remove the outputs of these frames; other files of the folder are not ours."""
     for id in ids:
-        for kind in KINDS:
-            _file(out, kind, id).unlink(missing_ok=True)
+        for product in PRODUCTS:
+            product.file(out, id).unlink(missing_ok=True)
 
 
 def _remove_shard_summaries(out: Path) -> None:
@@ -278,7 +231,7 @@ def _remove_shard_summaries(out: Path) -> None:
 
 def _remove_temporary(out: Path) -> None:
     """Remove what a killed run left half written; not beside other shards, which live."""
-    for folder in (out, *(out / kind for kind in KINDS)):
+    for folder in (out, *(out / product.name for product in PRODUCTS)):
         for path in folder.iterdir() if folder.is_dir() else ():
             if TEMPORARY.match(path.name):
                 path.unlink()

@@ -1,51 +1,167 @@
-"""Files of a frame: depth, confidence and points."""
+"""What is written of a frame: a table of files, and the functions that write them."""
 
+import math
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from deltas_nets.captures.frame import Frame
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_atomically
 
-MAX_MILLIMETRES = 65534  # 65535 means "none" to some readers
+__all__ = [
+    "PRODUCTS",
+    "FrameOutput",
+    "OutputOptions",
+    "Product",
+    "check_depth_fits",
+    "products_of",
+    "read_depth_png",
+    "read_points_ply",
+    "remarks_on",
+    "write_confidence_png",
+    "write_depth_png",
+    "write_points_ply",
+]
+
+MILLIMETRES = 1000.0  # steps in a metre
+MAX_STEPS = 65534  # 65535 means "none" to some readers
+
+FINE_ENOUGH = 1000.0
+"""Metres from the origin up to which points are written in float32, whose steps are 0.06 mm there.
+Beyond, as of surveyed (UTM) coordinates, they are written in float64."""
 
 
-VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+class FrameOutput(NamedTuple):
+    """What is known of a frame when its files are written.
+
+    Attributes:
+        anchor: the frame.
+        depth: ``(H, W)`` metres, 0 where there is none.
+        confidence: ``(H, W)`` in [0, 1]; None where the network states none.
+        points: ``(N, 3)`` in the capture's world, metres.
+        colors: ``(N, 3)`` uint8.
+    """
+
+    anchor: Frame
+    depth: ArrayLike
+    confidence: ArrayLike | None
+    points: ArrayLike
+    colors: ArrayLike
 
 
-PLY_HEADER = """ply
-format binary_little_endian 1.0
-element vertex {count}
-property float x
-property float y
-property float z
-property uchar red
-property uchar green
-property uchar blue
-end_header
-"""
+@dataclass(frozen=True)
+class OutputOptions:
+    """What all frames of a folder have in common."""
+
+    confidence: bool = True
+    """Whether the network states one."""
+    depth_scale: float = MILLIMETRES
+    """Steps of the depth image in a metre."""
+
+    def __post_init__(self) -> None:
+        if not (self.depth_scale > 0 and math.isfinite(self.depth_scale)):
+            raise ValueError(f"--depth-scale must be positive, got {self.depth_scale:g}")
+
+    @property
+    def max_depth(self) -> float:
+        """The largest depth that the files hold, metres."""
+        return MAX_STEPS / self.depth_scale
 
 
-def write_depth_png(path: Path, depth: ArrayLike) -> None:
-    """Write ``(H, W)`` metres as 16-bit millimetres.
+class Product(NamedTuple):
+    """A file of every frame.
+
+    Attributes:
+        name: of its folder.
+        suffix: of the file.
+        write: writes it.
+        needs_confidence: it is written only where the network states a confidence.
+    """
+
+    name: str
+    suffix: str
+    write: Callable[[Path, FrameOutput, OutputOptions], None]
+    needs_confidence: bool = False
+
+    def file(self, folder: Path, id: str) -> Path:
+        """Where it is written."""
+        return folder / self.name / f"{id}{self.suffix}"
+
+
+def _write_depth(path: Path, frame: FrameOutput, options: OutputOptions) -> None:
+    write_depth_png(path, frame.depth, scale=options.depth_scale)
+
+
+def _write_confidence(path: Path, frame: FrameOutput, options: OutputOptions) -> None:
+    assert frame.confidence is not None  # or the folder would not hold this product
+    write_confidence_png(path, frame.confidence)
+
+
+def _write_points(path: Path, frame: FrameOutput, options: OutputOptions) -> None:
+    write_points_ply(path, frame.points, frame.colors)
+
+
+PRODUCTS = (
+    Product("depth", ".png", _write_depth),
+    Product("confidence", ".png", _write_confidence, needs_confidence=True),
+    Product("points", ".ply", _write_points),
+)
+
+
+def products_of(options: OutputOptions) -> tuple[Product, ...]:
+    """What a folder with these options holds."""
+    return tuple(row for row in PRODUCTS if options.confidence or not row.needs_confidence)
+
+
+def remarks_on(frame: FrameOutput, options: OutputOptions) -> dict[str, Any]:
+    """What the summary says of a frame beside its record: pixels too far for the depth image."""
+    far = np.asarray(frame.depth, dtype=np.float64) > options.max_depth
+    count = int((far & np.isfinite(frame.depth)).sum())
+    return {"saturated_pixels": count} if count else {}
+
+
+def check_depth_fits(depth_range: tuple[float, float], options: OutputOptions) -> None:
+    """Whether the depth that is searched can be written.
+
+    Raises:
+        UserError: its far end cannot.
+    """
+    _, far = depth_range
+    if far <= options.max_depth or math.isinf(far):
+        return
+    half = MAX_STEPS / (2 * far)  # networks may see beyond the range
+    digits = 10.0 ** math.floor(math.log10(half))
+    raise UserError(
+        f"depth/N.png holds up to {options.max_depth:g} m, and depth is searched up to {far:g} m",
+        "--depth-range",
+        f"add --depth-scale {half // digits * digits:g} for coarser steps, or search less far",
+    )
+
+
+def write_depth_png(path: Path, depth: ArrayLike, *, scale: float = MILLIMETRES) -> None:
+    """Write ``(H, W)`` metres as 16-bit steps, millimetres if no other scale is given.
 
     Unknown depth (0, negative, NaN, infinite) becomes 0; known depth stays known: below half
-    a millimetre it is written as 1, beyond 65.534 m as that.
+    a step it is written as 1, beyond 65534 steps as that.
     """
     metres = np.asarray(depth, dtype=np.float64)
     known = np.isfinite(metres) & (metres > 0)
-    millimetres = np.rint(1000 * np.where(known, metres, 0)).clip(1, MAX_MILLIMETRES)
-    image = Image.fromarray(np.where(known, millimetres, 0).astype(np.uint16))
+    steps = np.rint(scale * np.where(known, metres, 0)).clip(1, MAX_STEPS)
+    image = Image.fromarray(np.where(known, steps, 0).astype(np.uint16))
     write_atomically(path, lambda file: image.save(file, format="PNG"))
 
 
-def read_depth_png(path: Path) -> NDArray[np.float32]:
+def read_depth_png(path: Path, *, scale: float = MILLIMETRES) -> NDArray[np.float32]:
     """``(H, W)`` float32 metres of a file of `write_depth_png`, 0 where there is none."""
     with Image.open(path) as image:
-        return (np.asarray(image) / np.float64(1000)).astype(np.float32)
+        return (np.asarray(image) / np.float64(scale)).astype(np.float32)
 
 
 def write_confidence_png(path: Path, probability: ArrayLike) -> None:
@@ -58,28 +174,43 @@ def write_confidence_png(path: Path, probability: ArrayLike) -> None:
 def write_points_ply(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
     """Write points ``(N, 3)`` in metres with colors ``(N, 3)`` uint8 as binary PLY.
 
-    Points that are not finite are left out; viewers stumble over them.
+    Points that are not finite are left out; viewers stumble over them. Coordinates are float, or
+    double where they are too large for it.
     """
-    xyz, rgb = np.asarray(points, dtype=np.float32), np.asarray(colors)
+    xyz, rgb = np.asarray(points, dtype=np.float64), np.asarray(colors)
     if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise ValueError(
             f"points and colors must have shape (N, 3), colors uint8, "
             f"got {xyz.shape} and {rgb.shape} {rgb.dtype}"
         )
     finite = np.isfinite(xyz).all(axis=1)
-    vertices = np.empty(int(finite.sum()), dtype=VERTEX)
-    vertices["xyz"], vertices["rgb"] = xyz[finite], rgb[finite]
-    content = PLY_HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes()
+    xyz, rgb = xyz[finite], rgb[finite]
+    real = "double" if np.abs(xyz).max(initial=0) > FINE_ENOUGH else "float"
+    vertices = np.empty(len(xyz), dtype=_vertex(real))
+    vertices["xyz"], vertices["rgb"] = xyz, rgb
+    content = _ply_header(real, len(vertices)) + vertices.tobytes()
     write_atomically(path, lambda file: file.write(content))
 
 
-def read_points_ply(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def read_points_ply(
+    path: Path,
+) -> tuple[NDArray[np.float32] | NDArray[np.float64], NDArray[np.uint8]]:
     """Points ``(N, 3)`` and colors ``(N, 3)`` of a file of `write_points_ply`."""
-    header, _, body = path.read_bytes().partition(b"end_header\n")
-    found = re.search(rb"element vertex (\d+)", header)
-    if found is None or header + b"end_header\n" != PLY_HEADER.format(count=int(found[1])).encode(
-        "ascii"
-    ):
+    header, end, body = path.read_bytes().partition(b"end_header\n")
+    found = re.search(rb"element vertex (\d+)\nproperty (float|double) x", header)
+    real, count = (found[2].decode(), int(found[1])) if found else ("float", 0)
+    if header + end != _ply_header(real, count):
         raise UserError("the file is not one of ours", path, "read it with a PLY library")
-    vertices = np.frombuffer(body, dtype=VERTEX, count=int(found[1]))
+    vertices = np.frombuffer(body, dtype=_vertex(real), count=count)
     return vertices["xyz"].copy(), vertices["rgb"].copy()
+
+
+def _vertex(real: str) -> np.dtype[np.void]:
+    return np.dtype([("xyz", {"float": "<f4", "double": "<f8"}[real], 3), ("rgb", "u1", 3)])
+
+
+def _ply_header(real: str, count: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {real} {axis}" for axis in "xyz"]
+    lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")

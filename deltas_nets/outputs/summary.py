@@ -2,21 +2,25 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from deltas_nets.captures.ids import id_in_json
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.products import MILLIMETRES
 
 WRITER = "deltas depth"
 """Stands in summary.json and tells our folders from others."""
 SUMMARY = "summary.json"
+SCALE = "depth_scale"
+"""The setting that is there where depth images are not in millimetres."""
 SHARD_SUMMARY = re.compile(r"summary\.\d+-of-\d+\.json")
 
 
 def shard_summary(out: Path, shard: tuple[int, int]) -> Path:
-    """Where one of several runs keeps its own."""
+    """Where one of several runs keeps its own summary."""
     return out / f"summary.{shard[0]}-of-{shard[1]}.json"
 
 
@@ -41,9 +45,20 @@ def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
     summary = read_summary(out / SUMMARY)
     if summary is None or "view_sets" not in summary["settings"]:
         raise UserError("no run of deltas depth is recorded", out / SUMMARY, "run it first")
-    return tuple(
-        ViewSet(anchor, tuple(sources)) for anchor, sources in summary["settings"]["view_sets"]
-    )
+    recorded = summary["settings"]["view_sets"]
+    return tuple(ViewSet(str(anchor), tuple(map(str, sources))) for anchor, sources in recorded)
+
+
+def view_sets_in_json(view_sets: Sequence[ViewSet]) -> list[list[Any]]:
+    """View sets as settings hold them, for `recorded_view_sets`."""
+    return [[id_in_json(anchor), list(map(id_in_json, sources))] for anchor, sources in view_sets]
+
+
+def recorded_depth_scale(out: Path) -> float:
+    """Steps in a metre of a folder's depth images."""
+    summary = read_summary(out / SUMMARY)
+    scale: float = MILLIMETRES if summary is None else summary["settings"].get(SCALE, MILLIMETRES)
+    return scale
 
 
 def difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:

@@ -5,9 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.ids import id_in_json
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.folder import OutputFolder
+from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.predict.depth_map import PredictConfig, frames_of
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import predict_map, remembering
@@ -65,7 +67,7 @@ def predict_capture(
             if time.perf_counter() - recorded > SECONDS_BETWEEN_SUMMARIES:
                 folder.write_summary("running")
                 recorded = time.perf_counter()
-            report(str(views.anchor))
+            report(views.anchor)
         status = "complete"
     finally:
         folder.write_summary(status, seconds=round(time.perf_counter() - began, 3))
@@ -81,17 +83,14 @@ def _predict_into(
 ) -> bool:
     """Write one view set's outputs; whether nothing could be triangulated."""
     started = time.perf_counter()
-    result = predict_map(network, frames_of(capture, views), config)
+    frames = frames_of(capture, views)
+    result = predict_map(network, frames, config)
     valid = int((result.keypoints.depth > 0).sum())
     folder.write_frame(
-        views.anchor,
-        depth=result.depth,
-        probability=result.confidence,
-        points=result.points,
-        colors=result.colors,
+        FrameOutput(frames[0], result.depth, result.confidence, result.points, result.colors),
         record={
             "status": "ok" if valid else "no point triangulated",
-            "sources": views.sources,
+            "sources": list(map(id_in_json, views.sources)),
             "valid_points": valid,
             "seconds": round(time.perf_counter() - started, 4),
         },

@@ -18,6 +18,7 @@ from deltas_nets.evaluate.points import median_point_error, score_points
 from deltas_nets.evaluate.report import metrics_table
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.ours import predict_frame
 
@@ -61,12 +62,8 @@ def run_demo(
         "sparse": sparse._asdict() | {"median_relative_error": median},
     }
     folder.write_frame(
-        "left",
-        depth=result.depth,
-        probability=result.confidence,
-        points=result.points,
-        colors=result.colors,
-        record=record,
+        FrameOutput(pair.left, result.depth, result.confidence, result.points, result.colors),
+        record,
     )
     figure = out / "demo.png"
     title = f"{model.config.name} on Middlebury Motorcycle, left and right image"

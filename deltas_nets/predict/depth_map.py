@@ -61,14 +61,14 @@ class DepthMap(NamedTuple):
     Attributes:
         depth: ``(H, W)`` float32 metres; 0 where there is none.
         confidence: ``(H, W)`` float32 as in `FrameDepth`; None where the network states none.
-        points: ``(N, 3)`` in the capture's world, metres.
+        points: ``(N, 3)`` float64 in the capture's world, metres.
         colors: ``(N, 3)`` uint8.
         keypoints: the points that the map rests on.
     """
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32] | None
-    points: NDArray[np.float32]
+    points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     keypoints: KeypointDepths
 
@@ -91,7 +91,7 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> NDArray[np.float32]:
 
 def point_cloud(
     anchor: Frame, depth: NDArray[np.float32], size: tuple[int, int], work_size: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """World points of the map, about as many as the network has pixels, with their colours."""
     step = max(1, round(size[0] / work_size[0]))
     rows, columns = np.mgrid[step // 2 : size[0] : step, step // 2 : size[1] : step].reshape(2, -1)
@@ -103,7 +103,8 @@ def point_cloud(
     points = unproject(view, pixels[None], z[None])[0]
     colors = resize_image(anchor.read_image(), size)[rows, columns]
     known = z.numpy() > 0
-    return points.numpy()[known].astype(np.float32), colors[known]
+    in_world: NDArray[np.float64] = points.numpy()[known]
+    return in_world, colors[known]
 
 
 def frames_of(capture: Capture, views: ViewSet) -> list[Frame]:

@@ -36,7 +36,7 @@ class FrameDepth(NamedTuple):
     Attributes:
         depth: ``(H, W)`` float32 metres; 0 where ``min_confidence`` removed it.
         confidence: ``(H, W)`` float32, probability that the relative error is below 5 %.
-        points: ``(N, 3)`` in the capture's world, metres.
+        points: ``(N, 3)`` float64 in the capture's world, metres.
         colors: ``(N, 3)`` uint8.
         prediction: what the network gave, at the size it works at.
         images: ``(V, 3, h, w)`` the frames as the network saw them.
@@ -45,7 +45,7 @@ class FrameDepth(NamedTuple):
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
-    points: NDArray[np.float32]
+    points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     prediction: DepthPrediction
     images: torch.Tensor

@@ -10,7 +10,7 @@ from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
 from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.datasets.posed_images import PosedImages
-from deltas_nets.datasets.tuples import ScanNetTuples, open_scannet
+from deltas_nets.datasets.scannet import ScanNetViewSets, open_scannet
 from deltas_nets.losses.targets import read_nearest
 
 SIZE = (48, 64)
@@ -35,11 +35,11 @@ def tiny(root: Path, **more: object) -> TrainConfig:
     return replace(TINY, data=replace(TINY.data, scannet=scannet))
 
 
-def opened(config: ScanNetConfig, split: str = "train", **more: object) -> ScanNetTuples:
+def opened(config: ScanNetConfig, split: str = "train", **more: object) -> ScanNetViewSets:
     return open_scannet(config, split, **{"num_views": 3, "image_size": SIZE, **more})  # type: ignore[arg-type]
 
 
-def view_sets(tuples: ScanNetTuples) -> list[tuple[str, ViewSet]]:
+def view_sets(tuples: ScanNetViewSets) -> list[tuple[str, ViewSet]]:
     return [tuples.view_set(index) for index in range(len(tuples))]
 
 

@@ -13,6 +13,7 @@ from run_command import Run, assert_one_line
 from small_scannet import SCANNET, opened
 
 from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.readers.intrinsics import read_intrinsics
 from deltas_nets.captures.view_sets import ViewSet, doubtful_scale
@@ -117,14 +118,14 @@ def test_baselines_that_suit_the_depth_range_are_no_doubt(
 ) -> None:
     K, poses = np.eye(3), np.tile(np.eye(4), (num_frames, 1, 1))
     poses[:, 0, 3] = step * np.arange(num_frames)
-    frames = {id: Frame(id, Path(), (48, 64), K, pose) for id, pose in enumerate(poses)}
-    capture = Capture(path=Path(), frames=frames, lost={})
-    pairs = [ViewSet(id, (id + 1,)) for id in range(num_frames - 1)]
+    frames = [Frame(str(id), Path(), (48, 64), K, pose) for id, pose in enumerate(poses)]
+    capture = Capture(path=Path(), frames=Frames.of(frames), lost={})
+    pairs = [ViewSet(str(id), (str(id + 1),)) for id in range(num_frames - 1)]
     assert doubtful_scale(capture, pairs, (0.5, 10.0)) is None
     # Whatever the unit, as long as the range is in it.
     assert doubtful_scale(capture, pairs, (0.5 * step, 10 * step)) is None
     assert doubtful_scale(capture, pairs, (500 * step, 1000 * step)) is not None
-    assert doubtful_scale(capture, [ViewSet(0, ())], (0.5, 10.0)) is None
+    assert doubtful_scale(capture, [ViewSet("0", ())], (0.5, 10.0)) is None
 
 
 def test_depth_of_another_shape_without_intrinsics_is_a_warning(make_capture: MakeCapture) -> None:

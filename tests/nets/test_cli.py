@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from PIL import Image
 from run_command import Run, assert_one_line
 
 from deltas_nets import cli
+from deltas_nets.commands.command_line import parse
 from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS, DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.outputs.folder import OutputFolder
 from deltas_nets.outputs.products import read_depth_png, read_points_ply
 from deltas_nets.weights_file import save_weights
 
@@ -130,20 +133,17 @@ def test_a_stopped_run_says_so_and_keeps_what_is_finished(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from deltas_nets import predict
+    finished, calls = OutputFolder.write_frame, []
 
-    finished = predict.predict_frame
-    calls = []
-
-    def stops_at_the_third(*arguments: object) -> predict.FrameDepth:
+    def stops_at_the_third(*arguments: Any, **more: Any) -> None:
         calls.append(1)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return finished(*arguments)  # type: ignore[arg-type]
+        finished(*arguments, **more)
 
     command = ["depth", make_capture(), "--out", tmp_path / "out", "--weights", weights]
     with monkeypatch.context() as patch:
-        patch.setattr(predict, "predict_frame", stops_at_the_third)
+        patch.setattr(OutputFolder, "write_frame", stops_at_the_third)
         stopped = run(*command)
     assert stopped.code == 130
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -401,9 +401,9 @@ def test_cost_prints_every_stage_and_writes_json(run: Run, tmp_path: Path) -> No
 
 def test_a_config_sets_the_defaults_and_flags_change_them() -> None:
     arguments = ["train", "--out", "x", "--config", "deltas-vgg9", "--steps", "5000"]
-    command = cli._parse(arguments)
+    command = parse(arguments, cli.COMMANDS)
     assert isinstance(command, Train)
     wanted = dataclasses.replace(TRAIN_CONFIGS["deltas-vgg9"], steps=5000)
     assert command.config == wanted and command.config.batch_size == 24
-    small = cli._parse(["train", "--out", "x"])
+    small = parse(["train", "--out", "x"], cli.COMMANDS)
     assert isinstance(small, Train) and small.config == TRAIN_CONFIGS["deltas-small"]

@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from small_output import summary_of, write_frame
 
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_json
-from deltas_nets.outputs.folder import OutputFolder, prepare_output
+from deltas_nets.outputs.folder import prepare_output
 from deltas_nets.outputs.products import (
     read_depth_png,
     read_points_ply,
@@ -27,22 +28,6 @@ from deltas_nets.outputs.products import (
 
 SETTINGS: dict[str, Any] = {"weights": "deltas-small", "views": 3, "depth_range": (0.5, 10.0)}
 MakeCapture = Callable[..., Path]
-
-
-def write_frame(folder: OutputFolder, id: int | str) -> None:
-    folder.write_frame(
-        id,
-        depth=np.full((4, 6), 2.0),
-        probability=np.full((4, 6), 0.5),
-        points=np.zeros((2, 3)),
-        colors=np.zeros((2, 3), np.uint8),
-        record={"status": "done", "seconds": 0.1},
-    )
-
-
-def summary_of(out: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((out / "summary.json").read_text())
-    return content
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -133,9 +118,9 @@ def test_a_new_folder_has_a_summary_from_the_start(tmp_path: Path) -> None:
     folder = prepare_output(out, settings=SETTINGS, head={"version": "1.0"})
     assert summary_of(out)["status"] == "running"
     assert summary_of(out)["settings"]["depth_range"] == [0.5, 10.0]
-    assert not folder.is_finished(7)
-    write_frame(folder, 7)
-    assert folder.is_finished(7)
+    assert not folder.is_finished("7")
+    write_frame(folder, "7")
+    assert folder.is_finished("7")
     folder.write_summary("complete", lost_frames=2)
     summary = summary_of(out)
     assert (summary["status"], summary["version"], summary["lost_frames"]) == ("complete", "1.0", 2)
@@ -147,14 +132,14 @@ def test_a_new_folder_has_a_summary_from_the_start(tmp_path: Path) -> None:
 
 def test_a_killed_run_is_continued(tmp_path: Path) -> None:
     killed = prepare_output(tmp_path, settings=SETTINGS)
-    write_frame(killed, 1)
-    write_frame(killed, 2)
+    write_frame(killed, "1")
+    write_frame(killed, "2")
     (tmp_path / "depth" / "2.png").unlink()
     (tmp_path / "depth" / ".2.png.x7.deltas-tmp").write_bytes(b"half")
     folder = prepare_output(tmp_path, settings=SETTINGS)
-    assert (folder.is_finished(1), folder.is_finished(2)) == (True, False)
-    folder.keep_frame(1)
-    write_frame(folder, 2)
+    assert (folder.is_finished("1"), folder.is_finished("2")) == (True, False)
+    folder.keep_frame("1")
+    write_frame(folder, "2")
     folder.write_summary("complete")
     frames = summary_of(tmp_path)["frames"]
     assert frames["1"] == frames["2"] == {"status": "done", "seconds": 0.1}
@@ -165,7 +150,7 @@ def test_a_killed_run_is_continued(tmp_path: Path) -> None:
 
 
 def test_other_settings_are_an_error_that_names_them(tmp_path: Path) -> None:
-    write_frame(prepare_output(tmp_path, settings=SETTINGS), 1)
+    write_frame(prepare_output(tmp_path, settings=SETTINGS), "1")
     before = files_in(tmp_path)
     with pytest.raises(UserError) as error:
         prepare_output(tmp_path, settings=SETTINGS | {"views": 5})
@@ -177,11 +162,11 @@ def test_other_settings_are_an_error_that_names_them(tmp_path: Path) -> None:
 
 
 def test_overwrite_starts_again_and_spares_what_is_not_ours(tmp_path: Path) -> None:
-    write_frame(prepare_output(tmp_path, settings=SETTINGS, frame_ids=[1]), 1)
+    write_frame(prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"]), "1")
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "depth" / "notes.txt").write_text("mine")
     folder = prepare_output(tmp_path, settings=SETTINGS | {"views": 5}, overwrite=True)
-    assert not folder.is_finished(1)
+    assert not folder.is_finished("1")
     assert set(files_in(tmp_path)) == {"summary.json", "notes.txt", "depth/notes.txt"}
     assert summary_of(tmp_path)["frames"] == {}
 
@@ -202,8 +187,8 @@ def test_overwrite_in_a_folder_of_someone_else_replaces_only_its_frames(tmp_path
         for id in (1, 2):
             (tmp_path / kind).mkdir(exist_ok=True)
             (tmp_path / kind / f"{id}.{suffix}").write_text("old")
-    folder = prepare_output(tmp_path, settings=SETTINGS, overwrite=True, frame_ids=[1])
-    assert not folder.is_finished(1)
+    folder = prepare_output(tmp_path, settings=SETTINGS, overwrite=True, frame_ids=["1"])
+    assert not folder.is_finished("1")
     assert (tmp_path / "depth" / "2.png").read_text() == "old"
 
 
@@ -235,18 +220,20 @@ def test_a_folder_without_write_permission_is_an_error(tmp_path: Path) -> None:
 
 
 def test_shards_share_a_folder_and_its_summary(tmp_path: Path) -> None:
-    first = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=[1])
-    second = prepare_output(tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=[2])
-    write_frame(first, 1)
+    first = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=["1"])
+    second = prepare_output(tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=["2"])
+    write_frame(first, "1")
     first.write_summary("complete")
     assert summary_of(tmp_path)["status"] == "running"
-    write_frame(second, 2)
+    write_frame(second, "2")
     second.write_summary("complete")
     summary = summary_of(tmp_path)
     assert summary["status"] == "complete" and set(summary["frames"]) == {"1", "2"}
     # A shard that starts again leaves the others' frames alone.
-    again = prepare_output(tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=[2], overwrite=True)
-    assert (again.is_finished(1), again.is_finished(2)) == (True, False)
+    again = prepare_output(
+        tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=["2"], overwrite=True
+    )
+    assert (again.is_finished("1"), again.is_finished("2")) == (True, False)
 
 
 def test_shards_that_start_and_finish_at_once_lose_nothing(tmp_path: Path) -> None:
@@ -258,7 +245,7 @@ def test_shards_that_start_and_finish_at_once_lose_nothing(tmp_path: Path) -> No
         try:
             barrier.wait()
             folder = prepare_output(tmp_path, settings=SETTINGS, shard=(index, count))
-            write_frame(folder, index)
+            write_frame(folder, str(index))
             barrier.wait()
             folder.write_summary("complete")
         except BaseException as error:

@@ -15,7 +15,7 @@ from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image, load_views
 from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.datasets.posed_images import PosedImages
-from deltas_nets.datasets.tuples import ScanNetTuples
+from deltas_nets.datasets.scannet import ScanNetViewSets
 from deltas_nets.errors import UserError
 from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.data_sets import validation_data
@@ -126,7 +126,7 @@ def test_validation_tuples_are_spread_over_the_split(scannet_root: Path) -> None
     few = validation_data(tiny(scannet_root, validation="all", validation_tuples=3))
     assert few is not None
     frames = few.dataset
-    assert isinstance(frames, ScanNetTuples)
+    assert isinstance(frames, ScanNetViewSets)
     assert [frames.view_set(index)[0][:9] for index in few.indices] == [
         "scene0000",
         "scene0706",
@@ -140,7 +140,7 @@ def test_validation_tuples_are_spread_over_the_split(scannet_root: Path) -> None
 def test_a_real_sample_of_scannet_is_read(shared_data: Path) -> None:
     config = ScanNetConfig(root=str(shared_data / "scannet_sample"), gap=1)
     tuples = opened(config, "test", image_size=(240, 320))
-    assert view_sets(tuples) == [("scene0707_00", ViewSet(1, (0, 2)))]
+    assert view_sets(tuples) == [("scene0707_00", ViewSet("1", ("0", "2")))]
     item = tuples[0]
     assert item.images.shape == (3, 3, 240, 320)
     assert 0.5 < float((item.depth > 0).float().mean()) <= 1

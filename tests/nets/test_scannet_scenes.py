@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from small_scannet import overwrite, written_list
 
-from deltas_nets.captures import scannet_scenes
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.datasets import scene_cache
 from deltas_nets.datasets.scene_cache import read_scene_cached
 from deltas_nets.datasets.scene_names import choose_scenes, find_scenes
-from deltas_nets.datasets.scenes import LeftOut, read_scene
+from deltas_nets.datasets.scenes import LeftOut, left_out, read_scene, skipped
 from deltas_nets.datasets.skip_list import SkipList, read_skip_list
 from deltas_nets.errors import UserError
 
@@ -89,12 +89,9 @@ def test_splits_that_cannot_be_used_are_refused(scannet_root: Path, tmp_path: Pa
 def test_a_scene_holds_what_a_capture_of_it_holds(scannet_root: Path) -> None:
     path = scannet_root / "scans" / "scene0000_00"
     scene, capture = read_scene(path), open_capture(path)
-    assert scene.ids.tolist() == list(capture.frames)
-    assert scene.left_out == LeftOut()
-    for position, id in enumerate(scene.ids):
-        ours, theirs = scene.frame(position), capture.frame(int(id))
-        for field in dataclasses.fields(ours):
-            assert np.array_equal(getattr(ours, field.name), getattr(theirs, field.name))
+    assert list(scene.frames) == list(capture.frames)
+    assert left_out(scene) == LeftOut()
+    assert scene.fingerprint() == capture.fingerprint()
 
 
 def test_unusable_frames_are_left_out_and_counted(scannet_copy: Path) -> None:
@@ -105,12 +102,12 @@ def test_unusable_frames_are_left_out_and_counted(scannet_copy: Path) -> None:
     overwrite(path / "pose" / "3.txt", "2 0 0 0  0 2 0 0  0 0 2 0  0 0 0 1")
     (path / "depth" / "4.png").unlink()
     scene = read_scene(path)
-    assert scene.ids.tolist() == [5, 6, 7, 8]
-    assert scene.left_out == LeftOut(lost=3, not_rigid=1, without_depth=1)
-    skipped = scene.without(np.array([False, True, False, True]))
-    assert skipped.ids.tolist() == [5, 7]
-    assert skipped.frame(1).image_path == path / "color" / "7.png"
-    assert skipped.left_out + LeftOut(listed=1) == LeftOut(3, 1, 1, listed=3)
+    assert list(scene.frames) == ["5", "6", "7", "8"]
+    assert left_out(scene) == LeftOut(lost=3, not_rigid=1, without_depth=1)
+    fewer = skipped(scene, np.array([False, True, False, True]))
+    assert list(fewer.frames) == ["5", "7"]
+    assert fewer.frames.at(1).image_path == path / "color" / "7.png"
+    assert left_out(fewer) + LeftOut(listed=1) == LeftOut(3, 1, 1, listed=3)
 
 
 def test_poses_are_read_once_and_again_when_they_change(
@@ -118,15 +115,21 @@ def test_poses_are_read_once_and_again_when_they_change(
 ) -> None:
     path, cache = scannet_copy / "scans" / "scene0000_00", tmp_path / "cache"
     (path / "depth" / "0.png").unlink()
+    overwrite(path / "pose" / "1.txt", "1 0 0 0")
     first = read_scene_cached(path, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(scannet_scenes, "read_pose", None)
+        patch.setattr(scene_cache, "read_scene", None)
         again = read_scene_cached(path, cache)
-    for name, value in first._asdict().items():
-        assert np.array_equal(getattr(again, name), value), name
-        assert type(getattr(again, name)) is type(value), name
+    assert again.fingerprint() == first.fingerprint()
+    assert left_out(again) == left_out(first) == LeftOut(lost=1, without_depth=1)
+    assert {id: str(lost.error) for id, lost in again.lost.items()} == {
+        id: str(lost.error) for id, lost in first.lost.items()
+    }
+    for ours, theirs in zip(again.frames.values(), first.frames.values(), strict=True):
+        for field in dataclasses.fields(ours):
+            assert np.array_equal(getattr(ours, field.name), getattr(theirs, field.name))
     (file,) = cache.iterdir()
     file.write_bytes(file.read_bytes()[:100])
-    assert read_scene_cached(path, cache).ids.tolist() == first.ids.tolist()
+    assert list(read_scene_cached(path, cache).frames) == list(first.frames)
     overwrite(path / "pose" / "3.txt", "nan " * 16)
-    assert read_scene_cached(path, cache).ids.tolist() == [1, 2, 4, 5, 6, 7, 8]
+    assert list(read_scene_cached(path, cache).frames) == ["2", "4", "5", "6", "7", "8"]

@@ -11,6 +11,7 @@ from run_fit import assert_same_state, logged
 from small_scannet import tiny, written_list
 
 from deltas_nets import cli
+from deltas_nets.commands.command_line import parse
 from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS
 from deltas_nets.config.scannet import ScanNetConfig
@@ -85,7 +86,7 @@ def test_the_papers_network_trains_by_the_papers_command(
 
 def test_the_papers_schedule_is_the_default() -> None:
     arguments = ["train", "--out", "x", "--config", "deltas-resnet50", "--data", "scannet"]
-    command = cli._parse([*arguments, "--root", "somewhere"])
+    command = parse([*arguments, "--root", "somewhere"], cli.COMMANDS)
     assert isinstance(command, Train)
     paper = TRAIN_CONFIGS["deltas-resnet50"]
     scannet = ScanNetConfig(root="somewhere")

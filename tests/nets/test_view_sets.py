@@ -5,12 +5,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pytest
 
 from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
@@ -28,15 +28,15 @@ def write_sets(folder: Path, content: object) -> Path:
 def row_of_cameras(centres: np.ndarray, *, turns: np.ndarray | None = None) -> Capture:
     """Frames without files at ``centres`` (N, 3), turned about y by ``turns`` (N,) rad."""
     K = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
-    frames = {}
+    frames = []
     for id, centre in enumerate(centres):
         turn = 0.0 if turns is None else float(turns[id])
         cos, sin = np.cos(turn), np.sin(turn)
         pose = np.eye(4)
         pose[:3, :3] = [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]
         pose[:3, 3] = -pose[:3, :3] @ centre
-        frames[id] = Frame(id, Path(f"{id}.jpg"), (48, 64), K, pose)
-    return Capture(Path("capture"), MappingProxyType(frames), {})
+        frames.append(Frame(str(id), Path(f"{id}.jpg"), (48, 64), K, pose))
+    return Capture(Path("capture"), Frames.of(frames), {})
 
 
 def along_x(*positions: float) -> Capture:
@@ -47,7 +47,7 @@ def test_sets_are_read_in_order(capture: Capture, tmp_path: Path) -> None:
     path = write_sets(
         tmp_path, [{"anchor": 2, "sources": [1, 3]}, {"anchor": 0, "sources": [1], "note": "x"}]
     )
-    assert read_view_sets(path, capture) == (ViewSet(2, (1, 3)), ViewSet(0, (1,)))
+    assert read_view_sets(path, capture) == (ViewSet("2", ("1", "3")), ViewSet("0", ("1",)))
 
 
 GOOD = {"anchor": 2, "sources": [1]}
@@ -62,15 +62,16 @@ GOOD = {"anchor": 2, "sources": [1]}
         ([], "empty"),
         ([GOOD, 3], "view set 2 of 2 is not an object"),
         ([{"anchor": 1}], "view set 1 of 1 is not an object with anchor and sources"),
-        ([{"anchor": "1", "sources": [2]}], "anchor '1', not a frame number"),
-        ([{"anchor": True, "sources": [2]}], "not a frame number"),
-        ([{"anchor": 1.5, "sources": [2]}], "not a frame number"),
-        ([{"anchor": 1, "sources": 2}], "no list of frame numbers"),
-        ([{"anchor": 1, "sources": ["2"]}], "no list of frame numbers"),
+        ([{"anchor": "", "sources": [2]}], "anchor '', not the id of a frame"),
+        ([{"anchor": True, "sources": [2]}], "not the id of a frame"),
+        ([{"anchor": 1.5, "sources": [2]}], "not the id of a frame"),
+        ([{"anchor": 1, "sources": 2}], "no list of ids"),
+        ([{"anchor": 1, "sources": [None]}], "no list of ids"),
         ([{"anchor": 1, "sources": []}], "no sources"),
         ([{"anchor": 1, "sources": [2, 1]}], "among its own sources"),
         ([{"anchor": 1, "sources": [2, 2]}], "a source twice"),
-        ([GOOD, GOOD], "an earlier set"),
+        ([{"anchor": 1, "sources": [2, "2"]}], "a source twice"),
+        ([GOOD, {"anchor": "2", "sources": [1]}], "an earlier set"),
         ([{"anchor": 77, "sources": [2]}], "frame 77, which"),
         ([{"anchor": 1, "sources": [-5]}], "the nearest are 0, 1, 2, 3"),
     ],
@@ -103,17 +104,17 @@ def test_a_set_that_names_a_lost_pose_is_an_error(make_capture: MakeCapture) -> 
 
 def test_an_anchor_may_stand_alone_with_sensor_depth(capture: Capture, tmp_path: Path) -> None:
     path = write_sets(tmp_path, [{"anchor": 1, "sources": []}])
-    assert read_view_sets(path, capture, allow_no_sources=True) == (ViewSet(1, ()),)
+    assert read_view_sets(path, capture, allow_no_sources=True) == (ViewSet("1", ()),)
 
 
-def test_frames_that_sets_name_are_decoded_and_others_are_not(make_capture: MakeCapture) -> None:
+def test_frames_that_sets_name_are_checked_and_others_are_not(make_capture: MakeCapture) -> None:
     folder = make_capture()
     path = folder / "color" / "3.jpg"
     path.write_bytes(path.read_bytes()[:-300])
     capture = open_capture(folder)
-    check_frames(capture, [ViewSet(0, (1, 2))], with_depth=True)
+    check_frames(capture, [ViewSet("0", ("1", "2"))], with_depth=True)
     with pytest.raises(UserError, match=r"truncated\), .*color/3.jpg: copy"):
-        check_frames(capture, [ViewSet(0, (1, 3))])
+        check_frames(capture, [ViewSet("0", ("1", "3"))])
 
 
 def test_damaged_sensor_depth_is_found_where_it_is_used(make_capture: MakeCapture) -> None:
@@ -121,47 +122,47 @@ def test_damaged_sensor_depth_is_found_where_it_is_used(make_capture: MakeCaptur
     path = folder / "depth" / "0.png"
     path.write_bytes(path.read_bytes()[:60])
     capture = open_capture(folder)
-    check_frames(capture, [ViewSet(0, (1, 2))])
+    check_frames(capture, [ViewSet("0", ("1", "2"))])
     with pytest.raises(UserError, match=r"depth/0.png"):
-        check_frames(capture, [ViewSet(0, (1, 2))], with_depth=True)
+        check_frames(capture, [ViewSet("0", ("1", "2"))], with_depth=True)
 
 
 def test_a_pose_that_is_not_finite_is_found() -> None:
     capture = along_x(0.0, 0.2)
     capture.frame(1).cam_from_world[0, 3] = np.nan
     with pytest.raises(UserError, match=r"pose of frame 1 is not finite, 1.jpg"):
-        check_frames(capture, [ViewSet(1, (0,))])
+        check_frames(capture, [ViewSet("1", ("0",))])
 
 
 def test_good_baselines_are_preferred_to_short_and_long_ones() -> None:
     capture = along_x(0.0, 0.02, 0.2, 0.6)
     (chosen,) = choose_view_sets(capture, 2, anchors=[0])
-    assert chosen == ViewSet(0, (2,))
+    assert chosen == ViewSet("0", ("2",))
 
 
 def test_working_depth_scales_the_baseline() -> None:
     capture = along_x(0.0, 0.02, 0.2, 1.2)
-    assert choose_view_sets(capture, 2, anchors=[0], working_depth=0.25)[0].sources == (1,)
-    assert choose_view_sets(capture, 2, anchors=[0], working_depth=15.0)[0].sources == (3,)
+    assert choose_view_sets(capture, 2, anchors=[0], working_depth=0.25)[0].sources == ("1",)
+    assert choose_view_sets(capture, 2, anchors=[0], working_depth=15.0)[0].sources == ("3",)
 
 
 def test_sources_lie_on_both_sides_of_the_anchor() -> None:
     capture = along_x(-0.24, -0.2, 0.0, 0.2, 0.24)
     (chosen,) = choose_view_sets(capture, 3, anchors=[2])
-    assert len({source < 2 for source in chosen.sources}) == 2
+    assert len({int(source) < 2 for source in chosen.sources}) == 2
 
 
 def test_a_camera_that_looks_elsewhere_is_not_chosen() -> None:
     centres = np.array([[0.0, 0, 0], [0.2, 0, 0], [-0.12, 0, 0]])
     capture = row_of_cameras(centres, turns=np.array([0.0, np.pi, 0.1]))
-    assert choose_view_sets(capture, 3, anchors=[0]) == (ViewSet(0, (2,)),)
+    assert choose_view_sets(capture, 3, anchors=[0]) == (ViewSet("0", ("2",)),)
 
 
 def test_without_an_acceptable_source_the_best_is_taken() -> None:
     capture = along_x(0.0, 3.0, 5.0)
-    assert choose_view_sets(capture, 2, anchors=[0]) == (ViewSet(0, (1,)),)
+    assert choose_view_sets(capture, 2, anchors=[0]) == (ViewSet("0", ("1",)),)
     still = along_x(1.0, 1.0)
-    assert choose_view_sets(still, 3) == (ViewSet(0, (1,)), ViewSet(1, (0,)))
+    assert choose_view_sets(still, 3) == (ViewSet("0", ("1",)), ViewSet("1", ("0",)))
 
 
 def test_a_distant_origin_changes_nothing() -> None:
@@ -177,11 +178,11 @@ def test_a_turned_world_changes_nothing() -> None:
     capture = row_of_cameras(positions, turns=np.cumsum(rng.uniform(-0.3, 0.3, 30)))
     new_from_world = np.eye(4)
     new_from_world[:3, :3] = [[0.0, 0.6, 0.8], [0.0, -0.8, 0.6], [1.0, 0.0, 0.0]]
-    frames = {
-        id: replace(frame, cam_from_world=frame.cam_from_world @ new_from_world)
-        for id, frame in capture.frames.items()
-    }
-    turned = Capture(capture.path, frames, {})
+    frames = [
+        replace(frame, cam_from_world=frame.cam_from_world @ new_from_world)
+        for frame in capture.frames.values()
+    ]
+    turned = Capture(capture.path, Frames.of(frames), {})
     assert choose_view_sets(turned, 4) == choose_view_sets(capture, 4)
 
 

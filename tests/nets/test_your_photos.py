@@ -36,7 +36,7 @@ def turned(capture: Capture) -> list[np.ndarray]:
     poses = []
     for id, frame in capture.frames.items():
         turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec([0.1 * id, 0.3, -0.2]).as_matrix()
+        turn[:3, :3] = Rotation.from_rotvec([0.1 * int(id), 0.3, -0.2]).as_matrix()
         poses.append(turn @ frame.cam_from_world)
     return poses
 
@@ -53,7 +53,7 @@ def test_a_capture_is_written_from_k_and_poses(
     photos = [frame.image_path for frame in frames]
     recipes["write_capture"](tmp_path / "new", photos, turned, frames[0].K)
     written = open_capture(tmp_path / "new")
-    assert list(written.frames) == [0, 1, 2, 3]
+    assert list(written.frames) == ["0", "1", "2", "3"]
     for frame, old, pose in zip(written.frames.values(), frames, turned, strict=True):
         assert np.abs(frame.cam_from_world - pose).max() < 1e-12
         assert np.array_equal(frame.K, old.K)

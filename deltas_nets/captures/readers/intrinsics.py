@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deltas_nets.captures.capture import FloatArray
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 

@@ -6,22 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deltas_nets.captures.capture import Capture, FloatArray, Frame, ids_in_words, image_size_of
+from deltas_nets.captures.capture import Capture, FloatArray, Frame, Lost
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrinsics
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
-__all__ = [
-    "NESTING",
-    "SceneFiles",
-    "find_files",
-    "is_scene",
-    "read",
-    "read_pose",
-    "recognises",
-    "world_from_cam_inverse",
-]
+__all__ = ["LAYOUT", "NESTING", "is_scene", "read", "recognises", "world_from_cam_inverse"]
 
+LAYOUT = "folders color, pose and intrinsic (ScanNet's export layout)"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
 """Folders that scenes may lie in, inside of the one that is named."""
@@ -33,7 +27,7 @@ RIGID_TOLERANCE = 2e-3
 _NO_POSE = "repair it or take the frame out of the view sets"
 
 
-class SceneFiles(NamedTuple):
+class _SceneFiles(NamedTuple):
     """What the folder of one scene holds; poses are not read yet.
 
     Attributes:
@@ -64,39 +58,56 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Capture:
-    """Read one scene; see `deltas_nets.captures.capture.open_capture` for the contract."""
+    """Read one scene; see `deltas_nets.captures.opening.Reader` for the contract."""
     scene = _find_scene(path)
-    files = find_files(scene)
-    frames: dict[int, Frame] = {}
-    lost: dict[int, UserError] = {}
-    for id, image_path in files.images.items():
-        if id not in files.poses:
-            file = scene / "pose" / f"{id}.txt"
-            lost[id] = UserError(f"frame {id} has no pose file", file, _NO_POSE)
+    files = _find_files(scene)
+    frames: list[Frame] = []
+    lost: dict[str, Lost] = {}
+    for number, image_path in files.images.items():
+        pose = _read_pose(number, files.poses.get(number), scene)
+        if isinstance(pose, Lost):
+            lost[str(number)] = pose
             continue
-        pose = files.poses[id]
-        world_from_cam = read_pose(pose)
-        if not np.isfinite(world_from_cam).all():
-            lost[id] = UserError(f"the pose of frame {id} is not finite", pose, _NO_POSE)
-            continue
-        depth_path = files.depths.get(id)
-        frames[id] = Frame(
-            id=id,
-            image_path=image_path,
-            image_size=files.image_size,
-            K=files.K,
-            cam_from_world=world_from_cam_inverse(world_from_cam, path=pose),
-            depth_path=depth_path,
-            depth_K=None if depth_path is None else files.depth_K,
-            depth_size=None if depth_path is None else files.depth_size,
+        depth_path = files.depths.get(number)
+        frames.append(
+            Frame(
+                id=str(number),
+                image_path=image_path,
+                image_size=files.image_size,
+                K=files.K,
+                cam_from_world=pose,
+                depth_path=depth_path,
+                depth_K=None if depth_path is None else files.depth_K,
+                depth_size=None if depth_path is None else files.depth_size,
+            )
         )
-    if not frames:
-        what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(lost)})"
-        raise UserError(what, scene / "pose", "run the tracking again")
-    return Capture(path=scene, frames=frames, lost=lost, doubts=files.doubts)
+    return Capture(scene, Frames.of(frames, scene), lost, files.doubts)
 
 
-def find_files(scene: Path) -> SceneFiles:
+def _read_pose(number: int, path: Path | None, scene: Path) -> FloatArray | Lost:
+    """``(4, 4)`` cam_from_world, or why there is none."""
+    if path is None:
+        file = scene / "pose" / f"{number}.txt"
+        return Lost("no pose", UserError(f"frame {number} has no pose file", file, _NO_POSE))
+    remedy = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
+    try:
+        numbers = read_numbers(path, name="pose", remedy=remedy)
+    except UserError as error:
+        return Lost("malformed", error)
+    if len(numbers) != 16:
+        what = f"the pose file has {len(numbers)} numbers, not 16"
+        return Lost("malformed", UserError(what, path, remedy))
+    world_from_cam = np.array(numbers, dtype=np.float64).reshape(4, 4)
+    if not np.isfinite(world_from_cam).all():
+        what = f"the pose of frame {number} is not finite"
+        return Lost("no pose", UserError(what, path, _NO_POSE))
+    try:
+        return world_from_cam_inverse(world_from_cam, path=path)
+    except UserError as error:
+        return Lost("not rigid", error)
+
+
+def _find_files(scene: Path) -> _SceneFiles:
     """The files of a scene by frame number, and its intrinsics.
 
     Args:
@@ -140,7 +151,7 @@ def find_files(scene: Path) -> SceneFiles:
     elif depth_size is not None:
         doubts.append(_other_shape(depth_size, image_size, depth_file))
     said = tuple(doubt for doubt in doubts if doubt is not None)
-    return SceneFiles(images, poses, depths, image_size, K, depth_K, depth_size, said)
+    return _SceneFiles(images, poses, depths, image_size, K, depth_K, depth_size, said)
 
 
 def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
@@ -253,16 +264,3 @@ def _common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """
     sizes = (image_size_of(path) for path in paths)
     return next((size for size in sizes if size is not None), None)
-
-
-def read_pose(path: Path) -> FloatArray:
-    """(4, 4) world_from_cam, not finite where tracking was lost.
-
-    Raises:
-        UserError: the file does not hold 16 numbers.
-    """
-    remedy = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
-    numbers = read_numbers(path, name="pose", remedy=remedy)
-    if len(numbers) != 16:
-        raise UserError(f"the pose file has {len(numbers)} numbers, not 16", path, remedy)
-    return np.array(numbers, dtype=np.float64).reshape(4, 4)

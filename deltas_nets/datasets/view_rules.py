@@ -5,22 +5,23 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from deltas_nets.captures.capture import FloatArray
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.view_choice import spread_sources
-from deltas_nets.datasets.scenes import Scene
+from deltas_nets.datasets.scenes import frame_numbers
 
-__all__ = ["ByBaseline", "ByGap", "TupleRule"]
+__all__ = ["ByBaseline", "ByGap", "ViewRule"]
 
 ROWS = 256  # anchors whose distances to all frames are in memory at once
 
 
-class TupleRule(Protocol):
-    """A way to choose the sources of an anchor; positions are indices into a scene's frames."""
+class ViewRule(Protocol):
+    """A way to choose the sources of an anchor; positions are of a scene's frames."""
 
-    def anchors(self, scene: Scene) -> NDArray[np.intp]:
+    def anchors(self, frames: Frames) -> NDArray[np.intp]:
         """Positions of the frames that have enough sources, ascending."""
 
-    def sources(self, scene: Scene, anchor: int) -> list[int]:
+    def sources(self, frames: Frames, anchor: int) -> list[int]:
         """Positions of an anchor's sources, best first."""
 
     def in_words(self) -> str:
@@ -32,7 +33,7 @@ class ByGap(NamedTuple):
 
     The paper says "three views at a fixed interval of 20 frames" (section 4.1) and not which of
     them is the anchor; in the middle it shares most with the others. Of an even number one more
-    is before it. Only the frames of a tuple must be usable, not those between them.
+    is before it. Only the frames of a view set must be usable, not those between them.
 
     Attributes:
         gap: from one view to the next.
@@ -51,17 +52,19 @@ class ByGap(NamedTuple):
         """
         return [(-1) ** k * ((k + 1) // 2) * self.gap for k in range(1, self.num_views)]
 
-    def anchors(self, scene: Scene) -> NDArray[np.intp]:
+    def anchors(self, frames: Frames) -> NDArray[np.intp]:
         """Frames whose sources are all usable."""
-        complete = np.ones(len(scene.ids), dtype=bool)
+        numbers = frame_numbers(frames)
+        complete = np.ones(len(numbers), dtype=bool)
         for offset in self.offsets():
-            complete &= np.isin(scene.ids + offset, scene.ids, assume_unique=True)
+            complete &= np.isin(numbers + offset, numbers, assume_unique=True)
         return np.flatnonzero(complete)
 
-    def sources(self, scene: Scene, anchor: int) -> list[int]:
+    def sources(self, frames: Frames, anchor: int) -> list[int]:
         """Nearest first, the earlier one of two."""
-        wanted = scene.ids[anchor] + np.array(self.offsets())
-        return [int(position) for position in np.searchsorted(scene.ids, wanted)]
+        numbers = frame_numbers(frames)
+        wanted = numbers[anchor] + np.array(self.offsets())
+        return [int(position) for position in np.searchsorted(numbers, wanted)]
 
     def in_words(self) -> str:
         """How views are chosen."""
@@ -86,20 +89,20 @@ class ByBaseline(NamedTuple):
     max_rotation: float
     num_views: int
 
-    def anchors(self, scene: Scene) -> NDArray[np.intp]:
+    def anchors(self, frames: Frames) -> NDArray[np.intp]:
         """Frames with enough candidates."""
         enough = [
-            self._qualify(scene, slice(first, first + ROWS))[0].sum(axis=1) >= self.num_views - 1
-            for first in range(0, len(scene.ids), ROWS)
+            self._qualify(frames, slice(first, first + ROWS))[0].sum(axis=1) >= self.num_views - 1
+            for first in range(0, len(frames), ROWS)
         ]
         return np.flatnonzero(np.concatenate(enough)) if enough else np.zeros(0, dtype=np.intp)
 
-    def sources(self, scene: Scene, anchor: int) -> list[int]:
+    def sources(self, frames: Frames, anchor: int) -> list[int]:
         """Best first."""
-        qualify, cosines = self._qualify(scene, slice(anchor, anchor + 1))
+        qualify, cosines = self._qualify(frames, slice(anchor, anchor + 1))
         near = np.flatnonzero(qualify[0])
-        centres = _centres(scene.cam_from_world)
-        offsets = (centres[near] - centres[anchor]) @ scene.cam_from_world[anchor, :3, :3].T
+        centres = _centres(frames.cam_from_world)
+        offsets = (centres[near] - centres[anchor]) @ frames.cam_from_world[anchor, :3, :3].T
         angles = np.arccos(np.clip(cosines[0, near], -1, 1))
         log_score = -0.5 * (angles / (0.5 * self.max_rotation)) ** 2
         chosen = spread_sources(log_score, offsets, self.num_views - 1)
@@ -110,10 +113,10 @@ class ByBaseline(NamedTuple):
         angle = np.degrees(self.max_rotation)
         return f"{self.num_views} views {self.low:g} to {self.high:g} m and {angle:g} degrees apart"
 
-    def _qualify(self, scene: Scene, anchors: slice) -> tuple[NDArray[np.bool_], FloatArray]:
+    def _qualify(self, frames: Frames, anchors: slice) -> tuple[NDArray[np.bool_], FloatArray]:
         """``(A, F)`` whether frames may be sources of the anchors, and cosines of their angles."""
-        centres = _centres(scene.cam_from_world)
-        rotations = scene.cam_from_world[:, :3, :3].reshape(-1, 9)
+        centres = _centres(frames.cam_from_world)
+        rotations = frames.cam_from_world[:, :3, :3].reshape(-1, 9)
         distances = np.linalg.norm(centres[anchors, None] - centres, axis=-1)
         # The trace of R_a R_b^T is the sum of the products of their entries.
         cosines: FloatArray = (rotations[anchors] @ rotations.T - 1) / 2

@@ -1,4 +1,4 @@
-"""Frames of ScanNet to train on: some posed views of a scene, with their depth, per item."""
+"""Frames of ScanNet to train on: an item is a view set of one scene, with its depth."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -8,22 +8,23 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from deltas_nets.captures.capture import ids_in_words
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image, load_views
 from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.scene_cache import read_scene_cached
 from deltas_nets.datasets.scene_names import choose_scenes
-from deltas_nets.datasets.scenes import LeftOut, Scene
+from deltas_nets.datasets.scenes import LeftOut, frame_numbers, left_out, skipped
 from deltas_nets.datasets.skip_list import SkipList, read_skip_list
-from deltas_nets.datasets.tuple_rules import ByBaseline, ByGap, TupleRule
+from deltas_nets.datasets.view_rules import ByBaseline, ByGap, ViewRule
 from deltas_nets.errors import UserError
 
-__all__ = ["ScanNetTuples", "open_scannet", "tuple_rule"]
+__all__ = ["ScanNetViewSets", "open_scannet", "view_rule"]
 
 
-class ScanNetTuples(Dataset[PosedImages]):
+class ScanNetViewSets(Dataset[PosedImages]):
     """Item i is an anchor and its sources; a map-style data set for any ``DataLoader``.
 
     Nothing is random, and no image is decoded before its item is asked for.
@@ -35,7 +36,7 @@ class ScanNetTuples(Dataset[PosedImages]):
     """
 
     def __init__(
-        self, scenes: Mapping[str, Scene], rule: TupleRule, *, image_size: tuple[int, int]
+        self, scenes: Mapping[str, Capture], rule: ViewRule, *, image_size: tuple[int, int]
     ) -> None:
         self.scenes = list(scenes.items())
         self.rule = rule
@@ -54,29 +55,29 @@ class ScanNetTuples(Dataset[PosedImages]):
             UserError: a file cannot be read.
         """
         scene, positions = self._positions(index)
-        frames = [scene.frame(position) for position in positions]
+        frames = [scene.frames.at(position) for position in positions]
         images, views = load_views(frames, work_size=self.image_size)
         depth = np.stack([depth_at_image(frame, work_size=self.image_size) for frame in frames])
         # As bytes, which they were: a quarter of the memory on the way from a worker.
         return PosedImages((images * 255).round().byte(), views, torch.from_numpy(depth))
 
     def view_set(self, index: int) -> tuple[str, ViewSet]:
-        """The scene and the frame numbers of an item."""
-        scene, (anchor, *sources) = self._positions(index)
+        """The scene of an item, and the ids of its frames."""
+        scene, positions = self._positions(index)
         name, _ = self.scenes[self.anchors[index, 0]]
-        ids = scene.ids
-        return name, ViewSet(int(ids[anchor]), tuple(int(ids[source]) for source in sources))
+        anchor, *sources = map(scene.frames.id_at, positions)
+        return name, ViewSet(anchor, tuple(sources))
 
-    def _positions(self, index: int) -> tuple[Scene, list[int]]:
+    def _positions(self, index: int) -> tuple[Capture, list[int]]:
         if not 0 <= index < len(self):
             # Also what ends a `for` loop over the data set.
-            raise IndexError(f"tuple {index} of {len(self)}")
+            raise IndexError(f"view set {index} of {len(self)}")
         number, anchor = map(int, self.anchors[index])
         _, scene = self.scenes[number]
-        return scene, [anchor, *self.rule.sources(scene, anchor)]
+        return scene, [anchor, *self.rule.sources(scene.frames, anchor)]
 
 
-def tuple_rule(config: ScanNetConfig, num_views: int) -> TupleRule:
+def view_rule(config: ScanNetConfig, num_views: int) -> ViewRule:
     """How the config wants views to be chosen."""
     if config.tuples == "gap":
         return ByGap(config.gap_of(num_views), num_views)
@@ -92,8 +93,8 @@ def open_scannet(
     cache: Path | None = None,
     option: str = "--data.split",
     report: Callable[[str], None] = lambda _: None,
-) -> ScanNetTuples:
-    """Read the poses of a split's scenes and find its tuples.
+) -> ScanNetViewSets:
+    """Read the poses of a split's scenes and find its view sets.
 
     Args:
         config: where the scenes are, what to skip, which frames go together.
@@ -105,7 +106,7 @@ def open_scannet(
         report: gets a line of what there is, one of what is doubtful and one of what is missing.
 
     Raises:
-        UserError: there is no root, no scene, no tuple; or a file of a scene is malformed.
+        UserError: there is no root, no scene, no view set; or a file of a scene is malformed.
     """
     if config.root is None:
         raise UserError("where are the scenes?", "--data scannet", "add --root DIR")
@@ -117,16 +118,16 @@ def open_scannet(
         for name, path in folders.items():
             if name not in skip.whole:
                 scene = read_scene_cached(path, cache)
-                scenes[name] = scene.without(skip.listed(name, scene.ids))
+                scenes[name] = skipped(scene, skip.listed(name, frame_numbers(scene.frames)))
     except OSError as error:
         what = f"the scenes cannot be read ({error.strerror or error})"
         raise UserError(what, error.filename or root, "check it, and its permissions") from error
-    rule = tuple_rule(config, num_views)
-    found = ScanNetTuples(scenes, rule, image_size=image_size)
-    left_out = sum((scene.left_out for scene in scenes.values()), LeftOut())
-    usable = sum(len(scene.ids) for scene in scenes.values())
+    rule = view_rule(config, num_views)
+    found = ScanNetViewSets(scenes, rule, image_size=image_size)
+    missed = sum(map(left_out, scenes.values()), LeftOut())
+    usable = sum(len(scene.frames) for scene in scenes.values())
     unused = len(folders) - len(scenes)
-    counts = f"{usable} usable frames in {len(scenes)} scenes; left out: {left_out.in_words()}"
+    counts = f"{usable} usable frames in {len(scenes)} scenes; left out: {missed.in_words()}"
     counts += f", {unused} scenes listed as a whole" if unused else ""
     if not len(found):
         remedy = "check the numbers of the frames, --data.skip, and --data.gap or --data.baseline"
@@ -142,11 +143,11 @@ def open_scannet(
     return found
 
 
-def _all_anchors(scenes: list[Scene], rule: TupleRule) -> NDArray[np.int32]:
-    """``(T, 2)`` number of the scene and position of the anchor, of every tuple."""
+def _all_anchors(scenes: list[Capture], rule: ViewRule) -> NDArray[np.int32]:
+    """``(T, 2)`` number of the scene and position of the anchor, of every view set."""
     parts = [np.zeros((0, 2), dtype=np.int32)]
     for number, scene in enumerate(scenes):
-        positions = rule.anchors(scene)
+        positions = rule.anchors(scene.frames)
         scene_number = np.full(len(positions), number)
         parts.append(np.stack([scene_number, positions], axis=1).astype(np.int32))
     return np.concatenate(parts)

@@ -11,31 +11,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_scannet import SCANNET, SIZE, opened, overwrite, view_sets, written_list
 
-from deltas_nets.captures.capture import FloatArray
+from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.scannet import ScanNetConfig
-from deltas_nets.datasets.scenes import LeftOut, Scene
-from deltas_nets.datasets.tuple_rules import ByBaseline, ByGap
+from deltas_nets.datasets.view_rules import ByBaseline, ByGap
 from deltas_nets.errors import UserError
 
 
-def scene_of(ids: list[int], cam_from_world: FloatArray | None = None) -> Scene:
-    """A scene without files."""
+def frames_of(ids: list[int], cam_from_world: FloatArray | None = None) -> Frames:
+    """Frames without files."""
     poses = np.tile(np.eye(4), (len(ids), 1, 1)) if cam_from_world is None else cam_from_world
-    names = np.array([str(id).encode() for id in ids], dtype=np.bytes_)
-    return Scene(
-        Path("nowhere"),
-        SIZE,
-        K=np.eye(3),
-        depth_K=None,
-        depth_size=None,
-        ids=np.array(ids),
-        cam_from_world=poses,
-        images=names,
-        depths=names,
-        left_out=LeftOut(),
-        doubts=(),
+    return Frames.of(
+        Frame(str(id), Path(f"{id}.jpg"), SIZE, np.eye(3), pose)
+        for id, pose in zip(ids, poses, strict=True)
     )
 
 
@@ -46,16 +36,16 @@ frame_numbers = st.tuples(st.integers(1, 40), st.sets(st.integers(0, 39), max_si
 
 
 @given(ids=frame_numbers, gap=st.integers(1, 5), num_views=st.integers(2, 7))
-def test_by_gap_every_tuple_is_exact_and_none_is_forgotten(
+def test_by_gap_every_view_set_is_exact_and_none_is_forgotten(
     ids: list[int], gap: int, num_views: int
 ) -> None:
-    rule, scene = ByGap(gap, num_views), scene_of(ids)
-    anchors = rule.anchors(scene)
+    rule, frames = ByGap(gap, num_views), frames_of(ids)
+    anchors = rule.anchors(frames)
     for anchor in anchors:
-        sources = [ids[position] for position in rule.sources(scene, anchor)]
-        frames = sorted([ids[anchor], *sources])
-        assert len(frames) == num_views and set(frames) <= set(ids)
-        assert {after - before for before, after in itertools.pairwise(frames)} == {gap}
+        sources = [ids[position] for position in rule.sources(frames, anchor)]
+        seen = sorted([ids[anchor], *sources])
+        assert len(seen) == num_views and set(seen) <= set(ids)
+        assert {after - before for before, after in itertools.pairwise(seen)} == {gap}
         # As many before the anchor as after it, or one more; nearest first.
         before = sum(source < ids[anchor] for source in sources)
         assert before == num_views // 2
@@ -91,7 +81,7 @@ def test_by_baseline_every_source_is_in_range_and_no_anchor_is_forgotten(
     low, high, limit = 0.1, 0.4, 0.3
     poses = np.stack([rigid(camera[:3], 7 + camera[3:]) for camera in cameras])
     rule = ByBaseline(low, high, limit, num_views)
-    scene = scene_of(list(range(0, 3 * len(cameras), 3)), poses)
+    frames = frames_of(list(range(0, 3 * len(cameras), 3)), poses)
 
     def qualifies(one: int, other: int) -> bool:
         relative = poses[other] @ np.linalg.inv(poses[one])
@@ -100,26 +90,26 @@ def test_by_baseline_every_source_is_in_range_and_no_anchor_is_forgotten(
         margin = 1e-6  # hypothesis likes limits; there, rounding may decide
         return bool(low - margin < distance < high + margin and angle < limit + margin)
 
-    anchors = rule.anchors(scene).tolist()
+    anchors = rule.anchors(frames).tolist()
     for anchor in anchors:
-        sources = rule.sources(scene, anchor)
+        sources = rule.sources(frames, anchor)
         assert len(set(sources)) == num_views - 1
         assert all(qualifies(anchor, source) for source in sources)
-        assert sources == rule.sources(scene, anchor)
+        assert sources == rule.sources(frames, anchor)
     others = [sum(qualifies(a, b) for b in range(len(cameras))) for a in range(len(cameras))]
     assert set(anchors) <= {a for a, count in enumerate(others) if count >= num_views - 1}
-    sure = ByBaseline(low - 1e-5, high + 1e-5, limit + 1e-5, num_views).anchors(scene).tolist()
+    sure = ByBaseline(low - 1e-5, high + 1e-5, limit + 1e-5, num_views).anchors(frames).tolist()
     assert {a for a, count in enumerate(others) if count >= num_views - 1} <= set(sure)
 
 
 def test_sources_by_baseline_stand_on_both_sides() -> None:
     places = [np.array([x, 0, 0.0]) for x in (-0.21, -0.2, 0, 0.2, 0.21)]
-    scene = scene_of([1, 2, 3, 4, 5], np.stack([rigid(np.zeros(3), place) for place in places]))
-    sources = ByBaseline(0.1, 0.3, 0.1, 3).sources(scene, 2)
+    frames = frames_of([1, 2, 3, 4, 5], np.stack([rigid(np.zeros(3), place) for place in places]))
+    sources = ByBaseline(0.1, 0.3, 0.1, 3).sources(frames, 2)
     assert sorted(np.sign([places[source][0] for source in sources])) == [-1, 1]
 
 
-def test_tuples_stay_within_a_scene_and_off_skipped_frames(
+def test_view_sets_stay_within_a_scene_and_off_skipped_frames(
     scannet_copy: Path, tmp_path: Path
 ) -> None:
     overwrite(scannet_copy / "scans" / "scene0706_01" / "pose" / "8.txt", "nan " * 16)
@@ -129,7 +119,9 @@ def test_tuples_stay_within_a_scene_and_off_skipped_frames(
     tuples = opened(config, "all", report=said.append)
     whole = [("scene0000_00", anchor) for anchor in (2, 4, 6)]  # not 1, 3, 5: they need frame 3
     whole += [("scene0706_01", anchor) for anchor in (2, 3, 4, 5)]  # not 6: it needs frame 8
-    wanted = [(name, ViewSet(anchor, (anchor - 2, anchor + 2))) for name, anchor in whole]
+    wanted = [
+        (name, ViewSet(str(anchor), (str(anchor - 2), str(anchor + 2)))) for name, anchor in whole
+    ]
     # Frame 3 lies between 2 and 4, which are two apart without it.
     assert view_sets(tuples) == wanted
     assert view_sets(opened(config, "all")) == wanted
@@ -153,7 +145,7 @@ def test_what_the_system_does_not_read_is_named(scannet_copy: Path) -> None:
         opened(replace(SCANNET, root=str(scannet_copy)))
 
 
-def test_tuples_by_baseline_come_from_the_config(scannet_root: Path) -> None:
+def test_view_sets_by_baseline_come_from_the_config(scannet_root: Path) -> None:
     config = ScanNetConfig(
         root=str(scannet_root), tuples="baseline", baseline=(0.05, 0.3), max_rotation=25
     )

@@ -7,30 +7,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+import small_output
 from run_command import Run
 
-from deltas_nets import predict
 from deltas_nets.outputs.folder import OutputFolder, prepare_output
 
 SETTINGS: dict[str, Any] = {"views": 3}
 MakeCapture = Callable[..., Path]
 
 
-def write_frame(folder: OutputFolder, id: int) -> None:
-    folder.write_frame(
-        id,
-        depth=np.full((4, 6), 2.0),
-        probability=np.full((4, 6), 0.5),
-        points=np.zeros((2, 3)),
-        colors=np.zeros((2, 3), np.uint8),
-        record=record_of(id),
-    )
+def write_frame(folder: OutputFolder, id: str) -> None:
+    small_output.write_frame(folder, id, record_of(id))
 
 
-def record_of(id: int) -> dict[str, Any]:
-    return {"status": "ok", "sources": [id + 1, id + 2]}
+def record_of(id: str) -> dict[str, Any]:
+    return {"status": "ok", "sources": [int(id) + 1, int(id) + 2]}
 
 
 def frames_of(out: Path) -> dict[str, Any]:
@@ -44,49 +36,51 @@ def record_files(out: Path) -> list[str]:
 
 def test_frames_finished_after_the_last_summary_keep_their_records(tmp_path: Path) -> None:
     killed = prepare_output(tmp_path, settings=SETTINGS)
-    write_frame(killed, 1)
+    write_frame(killed, "1")
     killed.write_summary("running")
     assert record_files(tmp_path) == []
-    for id in (2, 3):
+    for id in ("2", "3"):
         write_frame(killed, id)
     assert record_files(tmp_path) == ["summary.records.jsonl"]
     with (tmp_path / "summary.records.jsonl").open("a") as file:
         file.write('["4", {"stat')  # killed in the middle of a line
     (tmp_path / "depth" / "3.png").unlink()  # killed before the last file of a frame
     again = prepare_output(tmp_path, settings=SETTINGS)
-    assert frames_of(tmp_path) == {"1": record_of(1), "2": record_of(2)}
+    assert frames_of(tmp_path) == {"1": record_of("1"), "2": record_of("2")}
     assert record_files(tmp_path) == []
-    write_frame(again, 3)
+    write_frame(again, "3")
     again.write_summary("complete")
-    assert frames_of(tmp_path) == {str(id): record_of(id) for id in (1, 2, 3)}
+    assert frames_of(tmp_path) == {id: record_of(id) for id in ("1", "2", "3")}
     assert record_files(tmp_path) == []
 
 
 def test_records_survive_a_second_kill(tmp_path: Path) -> None:
-    write_frame(prepare_output(tmp_path, settings=SETTINGS), 1)
+    write_frame(prepare_output(tmp_path, settings=SETTINGS), "1")
     with (tmp_path / "summary.records.jsonl").open("a") as file:
         file.write('["2", {"stat')
-    write_frame(prepare_output(tmp_path, settings=SETTINGS), 2)
+    write_frame(prepare_output(tmp_path, settings=SETTINGS), "2")
     prepare_output(tmp_path, settings=SETTINGS).write_summary("complete")
-    assert frames_of(tmp_path) == {"1": record_of(1), "2": record_of(2)}
+    assert frames_of(tmp_path) == {"1": record_of("1"), "2": record_of("2")}
 
 
 def test_shards_take_over_their_own_and_one_run_takes_all(tmp_path: Path) -> None:
     for index in (1, 2):
-        shard = prepare_output(tmp_path, settings=SETTINGS, shard=(index, 2), frame_ids=[index])
-        write_frame(shard, index)
-    again = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=[1])
+        shard = prepare_output(
+            tmp_path, settings=SETTINGS, shard=(index, 2), frame_ids=[str(index)]
+        )
+        write_frame(shard, str(index))
+    again = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=["1"])
     assert record_files(tmp_path) == ["summary.2-of-2.records.jsonl"]
     again.write_summary("complete")
-    assert frames_of(tmp_path) == {"1": record_of(1)}
+    assert frames_of(tmp_path) == {"1": record_of("1")}
     prepare_output(tmp_path, settings=SETTINGS).write_summary("complete")
-    assert frames_of(tmp_path) == {"1": record_of(1), "2": record_of(2)}
+    assert frames_of(tmp_path) == {"1": record_of("1"), "2": record_of("2")}
     assert record_files(tmp_path) == []
 
 
 def test_overwriting_forgets_the_records(tmp_path: Path) -> None:
-    write_frame(prepare_output(tmp_path, settings=SETTINGS, frame_ids=[1]), 1)
-    prepare_output(tmp_path, settings={"views": 2}, overwrite=True, frame_ids=[1])
+    write_frame(prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"]), "1")
+    prepare_output(tmp_path, settings={"views": 2}, overwrite=True, frame_ids=["1"])
     assert frames_of(tmp_path) == {} and record_files(tmp_path) == []
 
 
@@ -106,16 +100,16 @@ def test_shards_of_which_none_runs_are_stopped(tmp_path: Path) -> None:
 def test_sigterm_stops_a_run_as_ctrl_c_does(
     run: Run, make_capture: MakeCapture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finished, calls = predict.predict_frame, []
+    finished, calls = OutputFolder.write_frame, []
 
-    def killed_at_the_third(*arguments: Any) -> predict.FrameDepth:
+    def killed_at_the_third(*arguments: Any, **more: Any) -> None:
         calls.append(1)
         if len(calls) == 3:
             os.kill(os.getpid(), signal.SIGTERM)
-        return finished(*arguments)
+        finished(*arguments, **more)
 
     handler = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(predict, "predict_frame", killed_at_the_third)
+    monkeypatch.setattr(OutputFolder, "write_frame", killed_at_the_third)
     out = tmp_path / "out"
     stopped = run("depth", make_capture(), "--out", out, "--views", 2)
     assert (stopped.code, stopped.err) == (130, "deltas: stopped; the same command goes on\n")

@@ -1,4 +1,4 @@
-"""What is known of each finished frame, on the disk before its files are.
+"""A journal: what is known of each finished frame, on the disk before its files are.
 
 A summary of thousands of frames is too long to be written after each of them. So a line for each is
 added to a file beside it, ``summary.records.jsonl``, which is removed when the summary holds them,
@@ -14,13 +14,13 @@ from typing import Any
 
 from deltas_nets.outputs.atomic_files import cannot_write, plain
 
-__all__ = ["FrameRecords", "read_records", "remove_records"]
+__all__ = ["Journal", "read_journals", "remove_journals"]
 
 RECORDS = re.compile(r"summary(\.\d+-of-\d+)?\.records\.jsonl")
 
 
-class FrameRecords:
-    """The file of one run.
+class Journal:
+    """The journal of one run.
 
     Args:
         summary: the summary beside which it lies.
@@ -29,13 +29,13 @@ class FrameRecords:
     def __init__(self, summary: Path) -> None:
         self.path = summary.with_suffix(".records.jsonl")
 
-    def add(self, id: int | str, record: Mapping[str, Any]) -> None:
+    def add(self, id: str, record: Mapping[str, Any]) -> None:
         """Add a line and bring it to the disk.
 
         Raises:
             UserError: the system refuses.
         """
-        line = json.dumps([str(id), plain(record)], allow_nan=False)
+        line = json.dumps([id, plain(record)], allow_nan=False)
         try:
             with self.path.open("a", encoding="utf-8") as file:
                 # Starts a new line: the last one of a killed run may be cut.
@@ -46,11 +46,11 @@ class FrameRecords:
             raise cannot_write(self.path, error) from error
 
     def remove(self) -> None:
-        """The summary holds all of it."""
+        """Remove it; the summary holds all of it."""
         self.path.unlink(missing_ok=True)
 
 
-def read_records(folder: Path) -> dict[str, Any]:
+def read_journals(folder: Path) -> dict[str, Any]:
     """By frame, what the killed runs of a folder had recorded; a line that was cut is no record."""
     records: dict[str, Any] = {}
     for file in _files(folder):
@@ -67,8 +67,8 @@ def read_records(folder: Path) -> dict[str, Any]:
     return records
 
 
-def remove_records(folder: Path) -> None:
-    """Those of all runs."""
+def remove_journals(folder: Path) -> None:
+    """Remove the journals of all runs."""
     for file in _files(folder):
         file.unlink(missing_ok=True)
 

@@ -1,0 +1,103 @@
+"""Image files: whether they are whole, and their pixels, decoded once where memory allows."""
+
+import os
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from deltas_nets.errors import UserError
+
+__all__ = ["Header", "ImageMemory", "decode", "header_of_whole_file", "image_size_of"]
+
+_END_OF_JPEG = b"\xff\xd9"
+_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+"""What Pillow raises where a file is no image, or a damaged one."""
+
+
+class Header(NamedTuple):
+    """What an image file says of itself before its pixels.
+
+    Attributes:
+        size: (height, width).
+        mode: Pillow's word for the type of the pixels.
+    """
+
+    size: tuple[int, int]
+    mode: str
+
+
+class ImageMemory:
+    """Decoded images, those used last.
+
+    Args:
+        capacity: bytes that they may take.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._known: OrderedDict[Path, NDArray[np.uint8]] = OrderedDict()
+        self._used = 0
+
+    def get(self, path: Path, read: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        """The pixels of a file, from ``read`` if they are not known."""
+        if path not in self._known:
+            self._known[path] = read()
+            self._used += self._known[path].nbytes
+        pixels = self._known[path]
+        self._known.move_to_end(path)
+        while self._used > self.capacity:
+            _, forgotten = self._known.popitem(last=False)
+            self._used -= forgotten.nbytes
+        return pixels
+
+
+def decode(path: Path, *, remedy: str) -> Image.Image:
+    """Decode every pixel, so that a file cut short is found here and not later.
+
+    Raises:
+        UserError: the file is missing, or no image, or a damaged one.
+    """
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except FileNotFoundError as error:
+        raise UserError("the image does not exist", path, remedy) from error
+    except _UNREADABLE as error:
+        # Pillow's own texts repeat the path and a stream's address; only some help.
+        detail = " (the file is truncated)" if "truncated" in str(error) else ""
+        raise UserError(f"the image cannot be decoded{detail}", path, remedy) from error
+
+
+def header_of_whole_file(path: Path) -> Header | None:
+    """The header of a file that is surely whole; None where only decoding it can tell.
+
+    A PNG is whole if the checksums of its chunks are right, a JPEG if it ends with the marker of
+    its end, which compressed data never holds. Either is read 5 to 100 times faster than decoded.
+    """
+    try:
+        with path.open("rb") as file, Image.open(file) as image:
+            header = Header((image.height, image.width), image.mode)
+            if image.format == "PNG":
+                image.verify()
+                return header
+            if image.format in ("JPEG", "MPO"):
+                file.seek(-len(_END_OF_JPEG), os.SEEK_END)
+                return header if file.read() == _END_OF_JPEG else None
+    except _UNREADABLE:
+        pass
+    return None
+
+
+def image_size_of(path: Path) -> tuple[int, int] | None:
+    """(height, width) from the header of an image file; None if it is no image."""
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except _UNREADABLE:
+        return None

@@ -1,0 +1,24 @@
+"""What all commands have in common."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+__all__ = ["Command"]
+
+
+class Command:
+    """A command: a dataclass whose fields are its flags, whose docstring is its help."""
+
+    debug: bool
+    """Whether an error shows its traceback."""
+    going_on: ClassVar[str] = "start it again"
+    """What to do after the command was stopped."""
+
+    @classmethod
+    def parsed_as(cls, arguments: Sequence[str]) -> Any:
+        """The type that tyro parses; the defaults of flags may depend on other arguments."""
+        return cls
+
+    def run(self) -> None:
+        """Do it; what is heavy is imported here."""
+        raise NotImplementedError

@@ -1,0 +1,87 @@
+"""From the words of a command line to a command that runs, and an error in one line."""
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from textwrap import shorten
+from typing import Any, NoReturn, Union
+
+import tyro
+
+from deltas_nets import __version__
+from deltas_nets.commands.command import Command
+from deltas_nets.errors import UserError
+from deltas_nets.terminal import silent_without_reader, stopped_like_ctrl_c
+
+__all__ = ["parse", "run"]
+
+Commands = Sequence[type[Command]]
+
+
+def run(arguments: Sequence[str], commands: Commands) -> None:
+    """Run the command that the arguments name; without arguments, show what there is."""
+    with silent_without_reader():
+        if list(arguments) == ["--version"]:
+            print(f"deltas-depth {__version__}")
+            return
+        command = parse(list(arguments) or ["--help"], commands)
+        try:
+            with stopped_like_ctrl_c():
+                command.run()
+        except UserError as error:
+            if command.debug:
+                raise
+            _fail(error)
+        except KeyboardInterrupt:
+            print(f"deltas: stopped; {command.going_on}", file=sys.stderr)
+            sys.exit(130)
+
+
+def parse(arguments: Sequence[str], commands: Commands) -> Command:
+    """The command that the arguments name; one line of error where they make no sense."""
+    said = io.StringIO()
+    kinds: Any = Union[tuple(command.parsed_as(arguments) for command in commands)]  # noqa: UP007
+    try:
+        with contextlib.redirect_stderr(said):
+            command: Command = tyro.cli(
+                kinds,
+                prog="deltas",
+                description="Metric depth from posed images.",
+                args=arguments,
+            )
+    except ValueError as error:
+        _fail(UserError(str(error), "command line", _help_of(arguments, commands)))
+    except SystemExit as stopped:
+        if not stopped.code:
+            sys.stdout.flush()  # the help, which a reader may have had enough of
+            raise
+        what = shorten(_in_words(said.getvalue()), 200, placeholder=" ...")
+        _fail(UserError(what, "command line", _help_of(arguments, commands)))
+    return command
+
+
+def _in_words(box: str) -> str:
+    """What tyro draws a box for, as a line.
+
+    The line leaves out the title, which the text below repeats, and the last part, which points to
+    --help.
+    """
+    inside = [line for line in box.splitlines() if not line.startswith(("╭", "╰"))]
+    plain = re.sub(r"\[/?bold\]|│", " ", " ".join(inside))
+    parts = [" ".join(part.split()) for part in re.split("─{3,}", plain)]
+    said = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
+    # What a config, or one inside it, refused comes with tyro's or Python's name for where it is.
+    return re.sub(r"^Error parsing (__tyro\S+|[A-Z]\w+:) ", "", said)
+
+
+def _help_of(arguments: Sequence[str], commands: Commands) -> str:
+    names = {command.__name__.lower() for command in commands}
+    known = [word for word in arguments[:1] if word in names]
+    return " ".join(["see deltas", *known, "--help"])
+
+
+def _fail(error: UserError) -> NoReturn:
+    print(f"deltas: {error}", file=sys.stderr)
+    sys.exit(2)
