@@ -53,12 +53,16 @@ def check_continues(folder: Path, config: TrainConfig) -> None:
 
 def _check(folder: Path, name: str, saved: TrainConfig, value: Any) -> None:
     own = dict(_fields(saved))[name]
-    if own != value:
-        raise UserError(
-            f"the run to go on with has {name} {own}, not {value}",
-            folder / CONFIG,
-            "leave that option out, or start a new run in another folder",
+    if own == value:
+        return
+    remedy = "leave that option out, or start a new run in another folder"
+    if name == "steps" and value > own:
+        # The schedule of the learning rate is part of the result, and it has ended.
+        remedy = (
+            f"leave it out; a longer run is a new one from these weights: --out NEW "
+            f"--init {folder / WEIGHTS} --start-step {own} --steps {value}"
         )
+    raise UserError(f"the run to go on with has {name} {own}, not {value}", folder / CONFIG, remedy)
 
 
 def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
