@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 
 import torch
 
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.commands.train import encoder_file
 from deltas_nets.config import DataConfig, TrainConfig
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import gmacs
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
 from deltas_nets.train.data_sets import training_data
 from deltas_nets.train.fit import fit

@@ -19,12 +19,12 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.datasets.camera_effects import (
     RandomCornerBlur,
     RandomRollingExposure,
     RandomVignetting,
 )
-from deltas_nets.datasets.posed_images import PosedImages
 
 
 def choose_views(batch: PosedImages, order: Tensor) -> PosedImages:

@@ -10,10 +10,10 @@ from torch.utils.data import Dataset
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image, load_views
 from deltas_nets.config.scannet import ScanNetConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.scene_cache import read_scene_cached
 from deltas_nets.datasets.scene_names import choose_scenes
 from deltas_nets.datasets.scenes import LeftOut, frame_numbers, left_out, skipped

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from torch.utils.data import DataLoader, Dataset
 
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 
 MOST_WORKERS = 8
 

@@ -8,9 +8,9 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
 from deltas_nets.datasets.augment import Photometry, disturb_poses, draw_pose_errors
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.workers import rendered_ahead
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.export.graph import OUTPUTS, ExportConfig, FixedDeltas
 from deltas_nets.network.deltas import Deltas

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from deltas_geom.cameras.views import PosedViews
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.rooms.render import render_view
 from deltas_nets.rooms.scene import draw_room
 from deltas_nets.rooms.textures import texture_atlas

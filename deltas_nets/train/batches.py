@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
 from deltas_nets.datasets.augment import (
     Photometry,
@@ -22,7 +23,6 @@ from deltas_nets.datasets.augment import (
     mirror,
     resize,
 )
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.train.loader import ALL, Part
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from torch.utils.data import Subset
 
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.scannet import ScanNetViewSets, open_scannet
 from deltas_nets.rooms import Rooms
 

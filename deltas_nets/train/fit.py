@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from torch import nn
 from torch.utils.data import Subset
 
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.rooms import evaluate_rooms
 from deltas_nets.rooms import Rooms

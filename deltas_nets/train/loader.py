@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.scannet import ScanNetViewSets
 from deltas_nets.datasets.workers import leave_to_the_parent
 from deltas_nets.errors import UserError

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 
 
 def places_with_new_rooms(step: int, places: range, replay: int) -> list[int]:

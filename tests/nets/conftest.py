@@ -12,7 +12,7 @@ from run_command import Run, runner
 from deltas_geom import PosedViews
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.outputs.products import write_depth_png
 from deltas_nets.rooms import render_room
 

@@ -32,6 +32,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import (
     DataConfig,
     DetectorConfig,
@@ -41,7 +42,6 @@ from deltas_nets.config import (
     from_dict,
     to_dict,
 )
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module

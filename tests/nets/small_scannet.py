@@ -6,10 +6,10 @@ from pathlib import Path
 import torch
 
 from deltas_geom import in_image, project, unproject
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
 from deltas_nets.config.scannet import ScanNetConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.scannet import ScanNetViewSets, open_scannet
 from deltas_nets.losses.targets import read_nearest
 

@@ -14,9 +14,9 @@ from run_command import Run, assert_one_line
 
 from deltas_nets import load_model
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.config import DetectorConfig, NetworkConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.capture import evaluate_network

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from deltas_geom import Matches, PosedViews, Triangulation, triangulate
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import CONFIGS, DetectorConfig, NetworkConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.joint.judge import Judge, of_posterior, of_refinement, of_triangulation
 from deltas_nets.network.records import Decision, Matched, Posterior

@@ -12,6 +12,7 @@ from kornia.losses import inverse_depth_smoothness_loss
 from torch.nn.functional import binary_cross_entropy
 
 from deltas_geom import Matches, PosedViews, triangulate
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import (
     PAPER_LOSS,
     TRAIN_CONFIGS,
@@ -21,7 +22,6 @@ from deltas_nets.config import (
     NetworkConfig,
     to_dict,
 )
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.losses.dense import depth_loss, gradient_loss, smoothness_loss, spread_loss
 from deltas_nets.losses.losses import loss_functions, training_losses
 from deltas_nets.losses.points import confidence_loss, match_loss, point_loss, posterior_loss

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from deltas_geom import PosedViews, ShapeError, SparseDepth, Status
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.network.deltas import Deltas, DepthPrediction
 from deltas_nets.network.joint.context import Context
 from deltas_nets.network.lite.densifier import interpolate_sparse

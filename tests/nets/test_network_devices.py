@@ -11,9 +11,9 @@ from stand_in_device import DEVICE, on_device, one_device, to_device
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
 from deltas_nets.datasets.augment import Photometry
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.distill.labels import hard_labels
 from deltas_nets.distill.superpoint import SuperPoint
 from deltas_nets.distill.supervision import TeacherLabels

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, default_collate
 
 from deltas_geom.cameras.projection import project, unproject
 from deltas_geom.cameras.views import PosedViews
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.rooms import Rooms, draw_room, render_room, texture_atlas
 from deltas_nets.rooms.cast import cast_rays
 from deltas_nets.rooms.furniture import BOX, CYLINDER, ELLIPSOID

@@ -11,10 +11,10 @@ from small_scannet import SCANNET, SIZE, agreeing_share, opened, overwrite, tiny
 
 from deltas_geom import PosedViews
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image, load_views
 from deltas_nets.config.scannet import ScanNetConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.datasets.scannet import ScanNetViewSets
 from deltas_nets.errors import UserError
 from deltas_nets.train.batches import BatchMaker

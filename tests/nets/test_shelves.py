@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from torch.utils.data import Dataset
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import DataConfig, TrainConfig
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.rooms import Rooms
 from deltas_nets.train.loader import Part, StepSampler, step_loader
 from deltas_nets.train.shelves import Shelves, places_with_new_rooms

@@ -12,6 +12,7 @@ from run_fit import assert_same_state, logged
 
 from deltas_geom import PosedViews, fundamental_between, in_image, project, unproject
 from deltas_nets import load_model
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
 from deltas_nets.datasets.augment import (
     Photometry,
@@ -21,7 +22,6 @@ from deltas_nets.datasets.augment import (
     mirror,
     resize,
 )
-from deltas_nets.datasets.posed_images import PosedImages
 from deltas_nets.errors import UserError
 from deltas_nets.losses.targets import read_nearest
 from deltas_nets.rooms import Rooms, render_room

@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from deltas_nets.datasets.posed_images import PosedImages
+from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.datasets.workers import rendered_ahead
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
 from deltas_nets.weights_file import load_model
