@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
-from deltas_nets.train.checkpoint import CONFIG, load_config
+from deltas_nets.train.checkpoint import CONFIG, WEIGHTS, load_config
 
 Config = TypeVar("Config")
 
