@@ -8,6 +8,7 @@ asks all of all. ``strategies`` needs hypothesis and the target ``opencv`` needs
 """
 
 from deltas_geom.testing.fixed_scenes import (
+    named_scene,
     seeded_depths,
     seeded_map,
     seeded_scene,
@@ -22,6 +23,7 @@ from deltas_geom.testing.scenes import (
     behind_camera,
     default_intrinsics,
     forward_motion,
+    intrinsics_per_view,
     on_baseline,
     pure_rotation,
     right_angle,
@@ -44,6 +46,8 @@ __all__ = [
     "behind_camera",
     "default_intrinsics",
     "forward_motion",
+    "intrinsics_per_view",
+    "named_scene",
     "on_baseline",
     "pure_rotation",
     "right_angle",

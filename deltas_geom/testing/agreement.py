@@ -1,6 +1,8 @@
 """How invariants compare: assertions that print the failing numbers, and derivatives."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 from torch import Tensor
@@ -16,6 +18,27 @@ VALUE_TOLERANCE = 1e-9  # of values around 1, read or averaged
 EXTREMES = torch.tensor([[1e15, -1e15, 1e-15], [-1e15, 1e7, 1.0], [1e-15, 0.0, -1e-15]]).double()
 """``(3, 3)`` coordinates of very different sizes, whose ratios still fit float32."""
 
+_SLACK = ContextVar("slack", default=1.0)
+
+
+@contextmanager
+def allowing(tolerance: float) -> Iterator[None]:
+    """Inside, :func:`assert_near` allows as many times more as ``tolerance`` is of 1e-6.
+
+    Args:
+        tolerance: of pixels (px) and points (m).
+    """
+    token = _SLACK.set(tolerance / POINT_TOLERANCE)
+    try:
+        yield
+    finally:
+        _SLACK.reset(token)
+
+
+def slack() -> float:
+    """How many times more is allowed now than by default."""
+    return _SLACK.get()
+
 
 def assert_near(found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: str) -> None:
     """Raise ``AssertionError`` with the worst pair unless all are as close; NaN is not.
@@ -23,7 +46,7 @@ def assert_near(found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: 
     Args:
         found: of any shape.
         wanted: of the same shape.
-        tolerance: largest difference, or one for each entry.
+        tolerance: largest difference, or one for each entry; times :func:`slack`.
         unit: of both, for the message.
 
     Example:
@@ -35,7 +58,7 @@ def assert_near(found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: 
     if found.shape != wanted.shape:
         raise AssertionError(f"shape {tuple(found.shape)} instead of {tuple(wanted.shape)}")
     error = (found.detach() - wanted.detach()).abs()
-    allowed = torch.as_tensor(tolerance, dtype=error.dtype).expand(error.shape)
+    allowed = slack() * torch.as_tensor(tolerance, dtype=error.dtype).expand(error.shape)
     bad = ~(error <= allowed)  # NaN is bad
     if bool(bad.any()):
         excess = error.nan_to_num(torch.inf) / allowed.clamp(min=torch.finfo(error.dtype).tiny)

@@ -97,7 +97,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 def _call(make: partial[Any]) -> str:
     """The call as one would write it."""
-    arguments = [*map(str, make.args), *(f"{key}={value}" for key, value in make.keywords.items())]
+    arguments = [*map(repr, make.args), *(f"{key}={value}" for key, value in make.keywords.items())]
     return f"{make.func.__name__}({', '.join(arguments)})"
 
 

@@ -14,10 +14,8 @@ from deltas_geom.testing.registry import Invariant
 from deltas_geom.testing.scenes import (
     DEGENERATE_SCENES,
     PosedScene,
-    default_intrinsics,
-    right_angle,
+    intrinsics_per_view,
     rigid,
-    ring,
     scene_from,
 )
 
@@ -27,7 +25,8 @@ def seeded_scene(
 ) -> PosedScene:
     """A well-posed scene in short numbers, the same on every machine; float64.
 
-    Cameras look ahead from 25 cm beside each other, points lie around 3.5 m ahead.
+    Cameras look ahead from 25 cm beside each other, each with its own K; points lie around
+    3.5 m ahead.
 
     Args:
         seed: which one; 0 leaves the cameras unturned.
@@ -51,10 +50,40 @@ def seeded_scene(
     turn = (0.0 if seed == 0 else 0.25) * _draw(generator, num_views, 3)  # rad
     shift = torch.zeros(num_views, 3, dtype=torch.float64)  # m
     shift[:, 0] = -0.25 * torch.arange(num_views)
-    K = default_intrinsics().repeat(num_views, 1, 1)
+    K = intrinsics_per_view(num_views)
     K[:, 0, 1] = skew
     scene = scene_from(PosedViews(K, rigid(turn, shift)), points)
     return scene._replace(pixels=scene.pixels + noise * _draw(generator, num_views, num_points, 2))
+
+
+def named_scene(name: str, *, dtype: torch.dtype = torch.float64) -> PosedScene:
+    """One of ``DEGENERATE_SCENES``, seen by a camera of another K in each view.
+
+    Where singular values tie, at 90 degrees and on a ring, the focal length is one, as the ties
+    would go with it.
+
+    Args:
+        name: which one.
+        dtype: of everything.
+
+    Raises:
+        ValueError: there is no such scene.
+
+    Example:
+        >>> named_scene("on_baseline").pixels.tolist()
+        [[[320.0, 240.0]], [[304.0, 248.0]]]
+    """
+    if name not in DEGENERATE_SCENES:
+        raise ValueError(f"name must be one of {', '.join(DEGENERATE_SCENES)}, got {name!r}")
+    scene = DEGENERATE_SCENES[name](dtype=dtype)
+    old = scene.views.K
+    K = intrinsics_per_view(scene.views.num_views, dtype=dtype)
+    if name in _TIES:
+        K[:, [0, 1], [0, 1]] = old[:, [0, 1], [0, 1]]
+    # Multiplied first: whole numbers stay whole.
+    offset = (scene.pixels - old[:, None, :2, 2]) * K[:, None, [0, 1], [0, 1]]
+    pixels = offset / old[:, None, [0, 1], [0, 1]] + K[:, None, :2, 2]
+    return PosedScene(scene.views._replace(K=K), scene.points, pixels)
 
 
 def seeded_map(
@@ -143,6 +172,7 @@ def _draw(generator: torch.Generator, *shape: int) -> Tensor:
     return torch.randint(-64, 65, shape, generator=generator).double() / 64
 
 
+_TIES = ("right_angle", "ring")
 _POSED = (
     partial(seeded_scene, 0),
     partial(seeded_scene, 0, noise=1.0),
@@ -155,7 +185,7 @@ _POSED = (
 )
 _SEGMENTS = (
     *_POSED[:5],
-    *(partial(make, dtype=torch.float64) for make in DEGENERATE_SCENES.values()),
+    *(partial(named_scene, name) for name in DEGENERATE_SCENES),
     partial(seeded_scene, 2, num_points=9, skew=5.0),
 )
 _MAPS = (
@@ -189,10 +219,12 @@ def scenes_for(invariant: Invariant) -> list[partial[Any]]:
         least = invariant.least_views
         return [make for make in _POSED if make.keywords.get("num_views", 2) >= least]
     if invariant.scenes == "ties":
-        return [partial(make, dtype=torch.float64) for make in (right_angle, ring)]
+        return [partial(named_scene, name) for name in _TIES]
     if invariant.scenes == "named":
         dtypes = (torch.float64, torch.float32)
         return [
-            partial(make, dtype=dtype) for make in DEGENERATE_SCENES.values() for dtype in dtypes
+            partial(named_scene, name, dtype=dtype)
+            for name in DEGENERATE_SCENES
+            for dtype in dtypes
         ]
     return list(_OTHERS[invariant.scenes])

@@ -14,6 +14,7 @@ from kornia.geometry.subpix import spatial_soft_argmax2d
 from kornia.geometry.transform import remap
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import to_homogeneous
 from deltas_geom.cameras.pixels import normalize_pixels
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.testing.target import ImageSize, Target
@@ -41,6 +42,21 @@ def plain_torch() -> Target:
         null: Tensor = torch.linalg.svd(rows).Vh[..., -1, :]
         return null[..., :3] / null[..., 3:]
 
+    def rays(K: Tensor, pixels: Tensor) -> Tensor:
+        found: Tensor = to_homogeneous(pixels) @ torch.linalg.inv(K).mT
+        return found
+
+    def at_depth(K: Tensor, cam_from_world: Tensor, pixels: Tensor, depth: Tensor) -> Tensor:
+        in_camera = rays(K, pixels) * depth[..., None]
+        return (in_camera - cam_from_world[:, None, :3, 3]) @ cam_from_world[:, :3, :3]
+
+    def residual(proj: Tensor, pixels: Tensor, points: Tensor, weights: Tensor | None) -> Tensor:
+        seen = to_homogeneous(points) @ proj.mT
+        squared = (seen[..., :2] / seen[..., 2:] - pixels).square().sum(dim=-1)
+        heed = torch.ones_like(squared) if weights is None else weights.square()
+        found: Tensor = ((heed * squared).sum(dim=0) / heed.sum(dim=0)).sqrt()
+        return found
+
     def read(feature_map: Tensor, pixels: Tensor, image_size: ImageSize) -> Tensor:
         grid = normalize_pixels(pixels, image_size=image_size)[None, None]
         found = F.grid_sample(feature_map[None], grid, padding_mode="border", align_corners=False)
@@ -66,6 +82,9 @@ def plain_torch() -> Target:
         sample_map=read,
         soft_argmax=mean_position,
         rasterize=nearest,
+        unproject=at_depth,
+        rays=rays,
+        residual=residual,
     )
 
 
@@ -101,6 +120,11 @@ def kornia(solver: KorniaSolver = "eigh") -> Target:
         )
         return found[0, :, 0].mT
 
+    def at_depth(K: Tensor, cam_from_world: Tensor, pixels: Tensor, depth: Tensor) -> Tensor:
+        camera = PosedViews(K, cam_from_world).to_kornia(image_size=(1, 1))
+        found: Tensor = camera.unproject(pixels, depth[..., None])
+        return found
+
     def heatmap(logits: Tensor) -> Tensor:
         found: Tensor = spatial_soft_argmax2d(logits[None, None], normalized_coordinates=False)
         return found[0, 0]
@@ -114,11 +138,12 @@ def kornia(solver: KorniaSolver = "eigh") -> Target:
         weighted=False,
         sample_map=read,
         heatmap_argmax=heatmap,
+        unproject=at_depth,
     )
 
 
 def opencv() -> Target:
-    """OpenCV's ``projectPoints``, ``triangulatePoints`` and ``remap``.
+    """OpenCV's ``projectPoints``, ``undistortPoints``, ``triangulatePoints`` and ``remap``.
 
     Triangulation is of two views, without weights and gradient. Its fundamental matrices are
     estimated from matches: there is none of given cameras.
@@ -141,6 +166,13 @@ def opencv() -> Target:
         homogeneous = cv2.triangulatePoints(proj[0].numpy(), proj[1].numpy(), first, second)
         return torch.from_numpy(cv2.convertPointsFromHomogeneous(homogeneous.T)[:, 0])
 
+    def rays(K: Tensor, pixels: Tensor) -> Tensor:
+        views = [
+            torch.from_numpy(cv2.undistortPoints(view.copy(), k, None)[:, 0])
+            for k, view in zip(K.numpy(), pixels.numpy(), strict=True)
+        ]
+        return to_homogeneous(torch.stack(views))
+
     def read(feature_map: Tensor, pixels: Tensor, image_size: ImageSize) -> Tensor:
         # It takes places in float32 alone, whatever the map.
         x, y = _map_pixels(pixels, feature_map, image_size).float().numpy()[None].transpose(2, 0, 1)
@@ -159,6 +191,7 @@ def opencv() -> Target:
         weighted=False,
         differentiable=False,
         sample_map=read,
+        rays=rays,
     )
 
 

@@ -13,15 +13,20 @@ from deltas_geom import (
     epipolar_segments,
     fundamental_between,
     pixel_grid,
+    pixel_rays,
     project,
     rasterize_depth,
+    ray_parallax,
     refine_points,
+    reprojection_residual,
     sample_inv_depths,
     sample_map,
     sample_segments,
     soft_argmax,
     triangulate,
     triangulate_points,
+    triangulate_robust,
+    unproject,
 )
 from deltas_geom.testing.target import DepthRange, Drawer, ImageSize, Sampler, Target
 
@@ -40,6 +45,23 @@ def deltas() -> Target:
 
     def refined(proj: Tensor, pixels: Tensor, points: Tensor, weights: Tensor | None) -> Tensor:
         return refine_points(proj, pixels, points, weights, steps=3).points
+
+    def depth_points(K: Tensor, pose: Tensor, pixels: Tensor, depth: Tensor) -> Tensor:
+        return unproject(PosedViews(K, pose), pixels, depth)
+
+    def residual(proj: Tensor, pixels: Tensor, points: Tensor, weights: Tensor | None) -> Tensor:
+        equal = torch.ones_like(pixels[..., 0])
+        return reprojection_residual(proj, points, pixels, equal if weights is None else weights)
+
+    def parallax(proj: Tensor, points: Tensor) -> Tensor:
+        used = torch.ones(proj.shape[0], points.shape[0], dtype=torch.bool)
+        return ray_parallax(proj, points, used)
+
+    def robust(
+        proj: Tensor, pixels: Tensor, weights: Tensor | None, threshold: float
+    ) -> tuple[Tensor, Tensor]:
+        found = triangulate_robust(proj, pixels, weights, threshold=threshold)
+        return found.points, found.inliers
 
     def clipped(
         K: Tensor, pose: Tensor, pixels: Tensor, depth_range: DepthRange, image_size: ImageSize
@@ -123,4 +145,9 @@ def deltas() -> Target:
         rasterize=nearest,
         mean_depth=mean("pixel"),
         splat=mean("bilinear"),
+        unproject=depth_points,
+        rays=pixel_rays,
+        residual=residual,
+        parallax=parallax,
+        robust=robust,
     )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import wraps
 from typing import Literal
 
+from deltas_geom.testing.agreement import allowing
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.scenes import PosedScene
 from deltas_geom.testing.target import Target, fields_of
@@ -39,10 +40,10 @@ class Invariant:
 
     @property
     def least_views(self) -> int:
-        """How many views a scene with cameras must have: 1 for a projection, 2 or 3 for others."""
+        """How many views a scene must have: 1 for what a camera does alone, else 2 or 3."""
         if "many views" in self.needs:
             return 3
-        return 1 if self.needs == ("project",) else 2
+        return 1 if self.needs[0] in ("project", "unproject", "rays") else 2
 
     def offered_by(self, target: Target) -> bool:
         """Whether the target has what is needed."""
@@ -70,7 +71,8 @@ class Invariant:
             if views < self.least_views:
                 raise ValueError(f"{name} needs a scene of {self.least_views} views, got {views}")
             scene = first_views(scene, target.max_views)
-        self.check(target.checked(), scene, **choices)
+        with allowing(target.tolerance):
+            self.check(target.checked(), scene, **choices)
 
 
 INVARIANTS: dict[str, Invariant] = {}

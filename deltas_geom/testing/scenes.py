@@ -52,6 +52,27 @@ def default_intrinsics(*, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=dtype)
 
 
+def intrinsics_per_view(num_views: int, *, dtype: torch.dtype = torch.float64) -> Tensor:
+    """A camera ``(V, 3, 3)`` for each view, in whole numbers; the first is the default one.
+
+    They differ in focal length, aspect and principal point: code that takes the anchor's K for
+    all views is wrong by tens of pixels.
+
+    Example:
+        >>> intrinsics_per_view(2, dtype=torch.float32)[1]
+        tensor([[550.,   0., 304.],
+                [  0., 475., 248.],
+                [  0.,   0.,   1.]])
+    """
+    K = default_intrinsics(dtype=dtype).repeat(num_views, 1, 1)
+    step = torch.arange(num_views).to(dtype) % 5
+    K[:, 0, 0] += 50 * step
+    K[:, 1, 1] -= 25 * step
+    K[:, 0, 2] -= 16 * step
+    K[:, 1, 2] += 8 * step
+    return K
+
+
 def rigid(axis_angle: Tensor, translation: Tensor) -> Tensor:
     """Rigid transforms ``(*B, 4, 4)`` from rotations as axis times angle, and translations.
 

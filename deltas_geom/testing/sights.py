@@ -9,7 +9,7 @@ from deltas_geom.cameras.homogeneous import to_homogeneous
 from deltas_geom.cameras.pixels import in_image
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.status import Status
-from deltas_geom.testing.agreement import PIXEL_TOLERANCE, assert_near, is_good
+from deltas_geom.testing.agreement import PIXEL_TOLERANCE, assert_near, is_good, slack
 from deltas_geom.testing.target import DepthRange, ImageSize
 
 VISIBLE = (Status.OK, Status.NO_PARALLAX)
@@ -90,7 +90,8 @@ def assert_covers(
 def on_edge(pixels: Tensor, image_size: ImageSize, *, within: float = PIXEL_TOLERANCE) -> Tensor:
     """Whether pixels ``(*B, 2)`` are so close to the edge that rounding decides, ``(*B)``."""
     inner, outer = (
-        in_image(pixels, image_size=image_size, border=border) for border in (within, -within)
+        in_image(pixels, image_size=image_size, border=slack() * border)
+        for border in (within, -within)
     )
     return outer & ~inner
 

@@ -1,9 +1,11 @@
 """What an implementation under test offers."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 ImageSize = tuple[int, int]
@@ -37,8 +39,13 @@ _RETURNS: dict[str, tuple[str, ...]] = {
     "rasterize": ("depth (H, W)",),
     "mean_depth": _IMAGES,
     "splat": _IMAGES,
+    "unproject": ("points (V, N, 3)",),
+    "rays": ("rays (V, N, 3)",),
+    "residual": ("residual (N)",),
+    "parallax": ("angle (N)",),
+    "robust": ("points (N, 3)", "inliers (V, N) bool"),
 }
-_SOLVERS = "triangulate, judge or refine"
+_SOLVERS = "triangulate, judge, refine, residual or robust"
 _MADE_OF = {
     "weights": f"weighted=True and {_SOLVERS}",
     "gradients": "triangulate and differentiable=True",
@@ -69,8 +76,8 @@ class Target:
             sign, with x1^T F x0 = 0 for pixels x0 of view 0 and x1 of view 1.
         triangulate: ``(proj (V, 3, 4), pixels (V, N, 2), weights (V, N) or None) -> points
             (N, 3)`` in the world, metres; ``weights`` multiply the equations, None = all 1.
-        max_views: the most views that ``triangulate``, ``judge`` and ``refine`` take; None = any
-            number.
+        max_views: the most views that ``triangulate``, ``judge``, ``refine``, ``residual``,
+            ``parallax`` and ``robust`` take; None = any number.
         weighted: whether they heed weights; if not, they are called with None.
         differentiable: whether autograd goes through ``triangulate``.
         batched: whether ``triangulate`` takes leading batch dims, broadcast against each other.
@@ -99,10 +106,24 @@ class Target:
         mean_depth: ``(pixels (N, 2), depth (N), weights (N), image_size) -> (depth (H, W),
             weight (H, W))``: weighted mean and summed weight of each pixel's points.
         splat: the same, each point shared among its four neighbours bilinearly.
+        unproject: ``(K (V, 3, 3), cam_from_world (V, 4, 4), pixels (V, N, 2), depth (V, N)) ->
+            points (V, N, 3)``: the world points at a depth along each camera's z.
+        rays: ``(K (V, 3, 3), pixels (V, N, 2)) -> rays (V, N, 3)`` in each camera's own frame,
+            as long as makes z = 1.
+        residual: ``(proj (V, 3, 4), pixels (V, N, 2), points (N, 3), weights (V, N) or None) ->
+            residual (N)``: RMS distance of projections from pixels, px; of weights, their squares
+            count.
+        parallax: ``(proj (V, 3, 4), points (N, 3)) -> angle (N)``: the largest angle at which two
+            of the views' rays meet, rad.
+        robust: ``(proj (V, 3, 4), pixels (V, N, 2), weights (V, N) or None, threshold) ->
+            (points (N, 3), inliers (V, N) bool)``: the point of the views that see it within
+            ``threshold`` px, and which those are: none where there is no point.
+        tolerance: of pixels (px) and points (m). What else is compared is allowed as many times
+            more than by default. For what computes in float32, whatever it is given: 3e-3.
 
     Raises:
         TypeError: what has to be a function, or True or False, is something else.
-        ValueError: ``max_views`` is less than 2.
+        ValueError: ``max_views`` is less than 2, or ``tolerance`` is not positive.
 
     Example:
         >>> from deltas_geom.triangulation.triangulate import triangulate_points
@@ -135,6 +156,12 @@ class Target:
     rasterize: Callable[[Tensor, Tensor, ImageSize], Tensor] | None = None
     mean_depth: Drawer | None = None
     splat: Drawer | None = None
+    unproject: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor] | None = None
+    rays: Callable[[Tensor, Tensor], Tensor] | None = None
+    residual: Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor] | None = None
+    parallax: Callable[[Tensor, Tensor], Tensor] | None = None
+    robust: Callable[[Tensor, Tensor, Tensor | None, float], tuple[Tensor, Tensor]] | None = None
+    tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -151,17 +178,21 @@ class Target:
             raise TypeError(f"max_views must be whole, or None, got {self.max_views!r}")
         if self.max_views is not None and self.max_views < 2:
             raise ValueError(f"max_views must be 2 or more, or None, got {self.max_views}")
+        if not isinstance(self.tolerance, float | int):
+            raise TypeError(f"tolerance must be a number, got {self.tolerance!r}")
+        if not 0 < self.tolerance < math.inf:
+            raise ValueError(f"tolerance must be positive and finite, got {self.tolerance}")
 
     def offers(self, feature: str) -> bool:
         """Whether there is something to test.
 
         Args:
             feature: the name of a function above, or of what goes with some of them: "weights"
-                and "many views" (three and more) of triangulation, status and refinement,
-                "gradients" and "batches" of triangulation, "samples" (of either spacing),
-                "drawing" (of depth, in any of three ways).
+                and "many views" (three and more) of what has points and pixels, "gradients" and
+                "batches" of triangulation, "samples" (of either spacing), "drawing" (of depth, in
+                any of three ways).
         """
-        solves = any((self.triangulate, self.judge, self.refine))
+        solves = any((self.triangulate, self.judge, self.refine, self.residual, self.robust))
         more = {
             "weights": solves and self.weighted,
             "gradients": self.triangulate is not None and self.differentiable,
@@ -211,6 +242,18 @@ def _checked(
             got = f"({kinds})" if several else kinds
             what = "a torch.Tensor" if len(wanted) == 1 else f"{len(wanted)} torch.Tensors"
             raise TypeError(f"{where} must return {what}, {', '.join(wanted)}, got {got}")
-        return found
+        given = [part for part in arguments if isinstance(part, Tensor)]
+        exact = [_as_given(part, given) for part in parts]
+        return tuple(exact) if len(wanted) > 1 else exact[0]
 
     return call
+
+
+def _as_given(found: Any, given: list[Tensor]) -> Tensor:
+    """In the widest floating point dtype of the arguments, if of a narrower one itself."""
+    assert isinstance(found, Tensor)
+    dtype = found.dtype
+    for tensor in given:
+        if found.is_floating_point() and tensor.is_floating_point():
+            dtype = torch.promote_types(dtype, tensor.dtype)
+    return found.to(dtype)

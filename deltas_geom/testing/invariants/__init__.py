@@ -8,9 +8,16 @@ all with what they need, in the order of the table; a file has those of one oper
 
 # isort: off
 # The order in which they register is that of the table.
-from deltas_geom.testing.invariants import projection, fundamental
+from deltas_geom.testing.invariants import projection, unprojection, fundamental
 from deltas_geom.testing.invariants import segments, sampling, reading, matching
-from deltas_geom.testing.invariants import triangulation, status, refinement, rasterize
+from deltas_geom.testing.invariants import (
+    triangulation,
+    status,
+    refinement,
+    residual,
+    robust,
+    rasterize,
+)
 
 # isort: on
 from deltas_geom.testing.agreement import PIXEL_TOLERANCE, POINT_TOLERANCE
@@ -31,8 +38,11 @@ __all__ = [
     "rasterize",
     "reading",
     "refinement",
+    "residual",
+    "robust",
     "sampling",
     "segments",
     "status",
     "triangulation",
+    "unprojection",
 ]

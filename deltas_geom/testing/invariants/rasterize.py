@@ -40,9 +40,9 @@ def a_splat_keeps_weight_depth_and_place(target: Target, scene: DepthScene) -> N
     grid = pixel_grid(scene.image_size, dtype=depth.dtype)
     assert_near(weight.sum(), scene.weights.sum(), VALUE_TOLERANCE, "(weight)")
     found, wanted = (weight * depth).sum(), (scene.weights * scene.depth).sum()
-    assert_near(found, wanted, VALUE_TOLERANCE, "m (summed)")
+    assert_near(found, wanted, 1e-8, "m (summed)")
     center, true = weight.flatten() @ grid, scene.weights @ inner.pixels
-    assert_near(center, true, VALUE_TOLERANCE, "px (summed)")
+    assert_near(center, true, 1e-8, "px (summed)")
 
 
 @invariant("drawing", scenes="depths")
@@ -147,4 +147,4 @@ def _assert_same(
 ) -> None:
     for name, images in wanted.items():
         for one, other in zip(found[name], images, strict=True):
-            assert_near(one, other, VALUE_TOLERANCE, f"({name}{where})")
+            assert_near(one, other, 1e-8, f"({name}{where})")

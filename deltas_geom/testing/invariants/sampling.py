@@ -5,7 +5,13 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from deltas_geom.testing.agreement import PIXEL_TOLERANCE, assert_finite, assert_near, is_good
+from deltas_geom.testing.agreement import (
+    PIXEL_TOLERANCE,
+    assert_finite,
+    assert_near,
+    is_good,
+    slack,
+)
 from deltas_geom.testing.registry import first_views, invariant
 from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene
 from deltas_geom.testing.sights import VISIBLE, assert_covers, on_edge, sights
@@ -38,11 +44,12 @@ def samples_run_from_the_far_to_the_near_end(
     """
     near, far = depth_range
     for pixels, inv_depth, visible in _spaced(target, scene, depth_range, count):
+        rounding = 1e-10 * slack()
         shrinks = (inv_depth.diff(dim=-1) <= 0).any(dim=-1) & visible
         if bool(shrinks.any()):
             item = int(shrinks.nonzero()[0])
             raise AssertionError(f"inverse depths of item {item}: {inv_depth[item].tolist()} 1/m")
-        beyond = (inv_depth[:, 0] < 1 / far - 1e-12) | (inv_depth[:, -1] > 1 / near + 1e-12)
+        beyond = (inv_depth[:, 0] < 1 / far - rounding) | (inv_depth[:, -1] > 1 / near + rounding)
         if bool((beyond & visible).any()):
             item = int((beyond & visible).nonzero()[0])
             first, last = inv_depth[item, [0, -1]].tolist()
@@ -126,4 +133,4 @@ def _spaced(
 
 def _assert_even(steps: Tensor, visible: Tensor, unit: str) -> None:
     off = torch.where(visible[:, None], steps - steps.mean(dim=-1, keepdim=True), 0.0)
-    assert_near(off, torch.zeros_like(off), 1e-8, f"{unit} (step from the mean step)")
+    assert_near(off, torch.zeros_like(off), 1e-7, f"{unit} (step from the mean step)")

@@ -17,6 +17,7 @@ from deltas_geom.testing.agreement import (
     assert_near,
     assert_status,
     is_good,
+    slack,
 )
 from deltas_geom.testing.changes import ELSEWHERE, World, cut, transformed
 from deltas_geom.testing.registry import first_views, invariant
@@ -52,7 +53,9 @@ def segment_ends_are_visible_depths_of_the_range(
     near, far = depth_range
     depths = []
     for pixels in (start, end):
-        outside = visible & ~in_image(pixels, image_size=image_size, border=-PIXEL_TOLERANCE)
+        outside = visible & ~in_image(
+            pixels, image_size=image_size, border=-slack() * PIXEL_TOLERANCE
+        )
         if bool(outside.any()):
             item = int(outside.nonzero()[0])
             raise AssertionError(f"end {pixels[item].tolist()} px of item {item} is outside")
@@ -66,7 +69,7 @@ def segment_ends_are_visible_depths_of_the_range(
             offset, torch.zeros_like(offset), END_TOLERANCE, "px (end from a depth of the range)"
         )
         depths.append(inv_depth)
-    long = visible & ((end - start).norm(dim=-1) > END_TOLERANCE)
+    long = visible & ((end - start).norm(dim=-1) > slack() * END_TOLERANCE)
     swapped = long & (depths[0] > depths[1])
     if bool(swapped.any()):
         raise AssertionError(f"item {int(swapped.nonzero()[0])}: the far end is the near one")
@@ -214,7 +217,9 @@ def a_crop_of_the_source_clips_segments(
     of_whole, of_part = is_good(whole[2], VISIBLE), is_good(part[2], VISIBLE)
     share = torch.linspace(0, 1, 33, dtype=corner.dtype)[:, None]
     places = whole[0][:, None] * (1 - share) + whole[1][:, None] * share - corner
-    shown = in_image(places, image_size=new_size, border=END_TOLERANCE) & of_whole[:, None]
+    shown = (
+        in_image(places, image_size=new_size, border=slack() * END_TOLERANCE) & of_whole[:, None]
+    )
     for inside, outside, points in (
         (shown, part, places),
         (of_part[:, None], whole, torch.stack(part[:2], dim=1) + corner),
@@ -256,7 +261,7 @@ def _assert_same(
         torch.where(v, (x[1] - x[0]).norm(dim=-1), 0.0)
         for v, x in zip(visible, (found, wanted), strict=True)
     ]
-    differ = (visible[0] != visible[1]) & (torch.maximum(*length) > END_TOLERANCE)
+    differ = (visible[0] != visible[1]) & (torch.maximum(*length) > slack() * END_TOLERANCE)
     if bool(differ.any()):
         item = int(differ.nonzero()[0])
         says, before = (bool(mask[item]) for mask in visible)
