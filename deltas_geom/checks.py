@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+_CURES = {"ndarray": "torch.from_numpy({0})", "PosedViews": "{0}.proj, or a field of it"}
+
 
 class ShapeError(ValueError):
     """A tensor's trailing shape differs from what the operation documents."""
@@ -14,12 +16,15 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     A dim is a number, which must match, or a letter, which must have one size in all
     tensors of the call; after "+" it must not be 0. Leading batch dims are free.
 
+    Numbers are real: integers, which would be rounded to without a word or wrap around, are
+    refused in all but masks (bool) and what is named ``..._index``.
+
     Args:
         **named: ``name=(tensor, "+V 3 4")``.
 
     Raises:
         ShapeError: a trailing shape differs, or two tensors disagree on a letter.
-        TypeError: not a tensor.
+        TypeError: not a tensor, or one of integers or complex numbers.
 
     Example:
         >>> import torch
@@ -30,8 +35,9 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     """
     seen: dict[str, tuple[int, str]] = {}
     for name, (tensor, spec) in named.items():
-        if not isinstance(tensor, Tensor):
-            raise TypeError(f"{name} must be a torch.Tensor, got {type(tensor).__name__}")
+        check_tensor(**{name: tensor})
+        if not (tensor.dtype == torch.bool or name.endswith("_index")):
+            check_floating(**{name: tensor})
         dims = spec.replace("+", "").split()
         shape = tuple(tensor.shape)
         tail = shape[len(shape) - len(dims) :] if len(shape) >= len(dims) else None
@@ -54,6 +60,16 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
                 )
 
 
+def check_tensor(**named: object) -> None:
+    """Raise ``TypeError`` with the cure unless all are tensors."""
+    for name, value in named.items():
+        if not isinstance(value, Tensor):
+            kind = type(value).__name__
+            cure = _CURES.get(kind, "torch.stack({0}) or torch.tensor({0})").format(name)
+            cure = f": use {cure}" if kind in (*_CURES, "list", "tuple") else ""
+            raise TypeError(f"{name} must be a torch.Tensor, got {kind}{cure}")
+
+
 def check_bool(**named: Tensor | None) -> None:
     """Raise ``TypeError`` unless every mask given is bool: numbers may mean weights, or indices."""
     for name, mask in named.items():
@@ -65,7 +81,9 @@ def check_floating(**named: Tensor) -> None:
     """Raise ``TypeError`` unless every tensor is of real floating point numbers."""
     for name, tensor in named.items():
         if not tensor.is_floating_point():
-            raise TypeError(f"{name} must be floating point, got {tensor.dtype}: use .float()")
+            raise TypeError(
+                f"{name} must be floating point, got {tensor.dtype}: use {name}.float()"
+            )
 
 
 def check_index(**named: Tensor) -> None:

@@ -1,22 +1,17 @@
 """Sparse depth images from points: which pixel they fall on, and who wins."""
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.checks import (
-    batch_shape,
-    check_bool,
-    check_floating,
-    check_image_size,
-    check_shapes,
-)
+from deltas_geom.checks import batch_shape, check_bool, check_image_size, check_shapes
 from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.records import Record
 
 
-class SparseDepth(NamedTuple):
+class SparseDepth(Record):
     """A depth image that is mostly empty.
 
     Attributes:
@@ -58,7 +53,7 @@ def rasterize_depth(
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
-        TypeError: the mask is not bool, the weights are no tensor, or all numbers are integers.
+        TypeError: the mask is not bool, or what should be real numbers are integers or no tensor.
         ValueError: unknown reduce or splat, or an image without pixels.
 
     Source: the paper, section 3.3.
@@ -80,7 +75,6 @@ def rasterize_depth(
     check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
     pixels, depth, given = promoted(pixels, depth, given)
-    check_floating(depth=depth)
     used = depth.isfinite() & (depth > 0) & given.isfinite() & (given > 0)
     used = used & pixels.isfinite().all(dim=-1)
     if mask is not None:

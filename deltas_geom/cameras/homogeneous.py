@@ -3,17 +3,19 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.checks import check_shapes
+from deltas_geom.numerics.arithmetic import finite_or_zero, without_autocast
 
 
 @without_autocast
 def to_homogeneous(coordinates: Tensor) -> Tensor:
-    """Append a one: ``(*B, D)`` to ``(*B, D + 1)``.
+    """Append a one: ``(*B, D)`` to ``(*B, D + 1)``; what is NaN stays so.
 
     Example:
         >>> to_homogeneous(torch.tensor([2.0, 3.0]))
         tensor([2., 3., 1.])
     """
+    check_shapes(coordinates=(coordinates, "D"))
     return torch.cat([coordinates, torch.ones_like(coordinates[..., :1])], dim=-1)
 
 
@@ -43,13 +45,15 @@ def safe_sqrt(squared: Tensor) -> Tensor:
 def from_homogeneous(coordinates: Tensor) -> Tensor:
     """Divide by the last coordinate: ``(*B, D + 1)`` to ``(*B, D)``.
 
-    Coordinates at infinity (last coordinate exactly 0) give 0 with zero gradient; test
-    ``coordinates[..., -1] != 0`` to tell them apart.
+    Coordinates at infinity (last coordinate exactly 0), NaN or infinite give 0 with zero gradient;
+    test them, as ``coordinates[..., -1] != 0``, to tell them apart.
 
     Example:
         >>> from_homogeneous(torch.tensor([[4.0, 6.0, 2.0], [1.0, 1.0, 0.0]]))
         tensor([[2., 3.],
                 [0., 0.]])
     """
-    last = coordinates[..., -1:]
-    return safe_divide(coordinates[..., :-1], last, last != 0)
+    check_shapes(coordinates=(coordinates, "+D"))
+    known, _ = finite_or_zero(coordinates)
+    last = known[..., -1:]
+    return safe_divide(known[..., :-1], last, last != 0)

@@ -36,11 +36,12 @@ def pixel_grid(
 
 @without_autocast
 def in_image(pixels: Tensor, *, image_size: tuple[int, int], border: float = 0.0) -> Tensor:
-    """Whether pixels ``(*B, 2)`` lie in the image, at least ``border`` px from its edge.
+    """Whether pixels ``(*B, 2)`` lie in the image, at least ``border`` px from its edge; not NaN.
 
     Returns:
         ``(*B)`` bool.
     """
+    check_shapes(pixels=(pixels, "2"))
     height, width = image_size
     x, y = pixels.unbind(dim=-1)
     low = border - 0.5
@@ -52,23 +53,26 @@ def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     """Pixels ``(*B, 2)`` as `grid_sample` coordinates (``align_corners=False``).
 
     The image spans [-1, 1] whatever its resolution, so the same coordinates read a feature
-    map of any stride: pixel p lies at (p + 0.5) / stride - 0.5 of the map.
+    map of any stride: pixel p lies at (p + 0.5) / stride - 0.5 of the map. A coordinate that is
+    NaN or infinite is the border, NaN and minus infinity the left or upper one, without gradient:
+    the backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU).
 
     Example:
         >>> normalize_pixels(torch.tensor([-0.5, 1.5]), image_size=(2, 4))
         tensor([-1.,  1.])
     """
+    check_shapes(pixels=(pixels, "2"))
     at_zero, slope = normalizing(image_size, like=pixels)
-    return torch.addcmul(at_zero, pixels, slope)
+    grid = torch.addcmul(at_zero, pixels, slope)
+    return grid.nan_to_num(nan=-1.0, posinf=1.0, neginf=-1.0)
 
 
 def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
     """What :func:`normalize_pixels` gives to pixel (0, 0), and its slope, each ``(2,)``."""
     height, width = image_size
-    dtype = like.dtype if like.is_floating_point() else torch.get_default_dtype()
     # Not torch.tensor, which copies numbers of the host to the device and waits for them.
-    slope = torch.linspace(2 / width, 2 / height, 2, device=like.device, dtype=dtype)
-    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=like.device, dtype=dtype)
+    slope = torch.linspace(2 / width, 2 / height, 2, device=like.device, dtype=like.dtype)
+    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=like.device, dtype=like.dtype)
     return at_zero, slope
 
 
@@ -76,12 +80,13 @@ def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, T
 def resize_pixels(
     pixels: Tensor, *, old_size: tuple[int, int], new_size: tuple[int, int]
 ) -> Tensor:
-    """Where pixels ``(*B, 2)`` of an image go when it is resized.
+    """Where pixels ``(*B, 2)`` of an image go when it is resized; what is NaN stays so.
 
     Example:
         >>> resize_pixels(torch.tensor([0.0, 0.0]), old_size=(4, 4), new_size=(2, 2))
         tensor([-0.2500, -0.2500])
     """
+    check_shapes(pixels=(pixels, "2"))
     along_x, along_y = new_size[1] / old_size[1], new_size[0] / old_size[0]
     # As above: numbers of the host would be waited for.
     scale = torch.linspace(along_x, along_y, 2, device=pixels.device, dtype=pixels.dtype)

@@ -1,10 +1,14 @@
-"""Rigid transforms ``b_from_a`` as 4x4 matrices: inverse, relative pose, validity."""
+"""Rigid transforms ``b_from_a`` as 4x4 matrices: inverse, relative pose, validity.
+
+What comes of a pose that is not finite is NaN, so that whatever uses it next can tell, and passes
+no gradient.
+"""
 
 import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
 
 
 @without_autocast
@@ -18,6 +22,12 @@ def invert_pose(b_from_a: Tensor) -> Tensor:
         tensor(-2.)
     """
     check_shapes(b_from_a=(b_from_a, "4 4"))
+    known, finite = finite_or_zero(b_from_a, dims=2)
+    return torch.where(finite[..., None, None], inverse_of_finite(known), torch.nan)
+
+
+def inverse_of_finite(b_from_a: Tensor) -> Tensor:
+    """:func:`invert_pose` of what is finite."""
     rotation = b_from_a[..., :3, :3].mT
     translation = -rotation @ b_from_a[..., :3, 3:]
     return torch.cat([torch.cat([rotation, translation], dim=-1), b_from_a[..., 3:, :]], dim=-2)
@@ -29,18 +39,20 @@ def relative_pose(b_from_world: Tensor, a_from_world: Tensor) -> Tensor:
     check_shapes(b_from_world=(b_from_world, "4 4"), a_from_world=(a_from_world, "4 4"))
     batch_shape(b_from_world.shape[:-2], a_from_world.shape[:-2])
     b_from_world, a_from_world = promoted(b_from_world, a_from_world)
-    return b_from_world @ invert_pose(a_from_world)
+    (b, b_finite), (a, a_finite) = (finite_or_zero(x, 2) for x in (b_from_world, a_from_world))
+    finite = (a_finite & b_finite)[..., None, None]
+    return torch.where(finite, b @ inverse_of_finite(a), torch.nan)
 
 
 @without_autocast
 def camera_centers(cam_from_world: Tensor) -> Tensor:
     """World positions ``(*B, 3)`` of cameras ``(*B, 4, 4)``, metres."""
     check_shapes(cam_from_world=(cam_from_world, "4 4"))
-    rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3:]
-    return -(rotation.mT @ translation).squeeze(-1)
+    known, finite = finite_or_zero(cam_from_world, dims=2)
+    centers = -(known[..., :3, :3].mT @ known[..., :3, 3:]).squeeze(-1)
+    return torch.where(finite[..., None], centers, torch.nan)
 
 
-@without_autocast
 def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:
     """Whether ``(*B, 4, 4)`` are finite rotations with a translation, ``(*B)`` bool.
 
@@ -50,8 +62,14 @@ def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:
         b_from_a: ``(*B, 4, 4)``.
         tolerance: largest deviation of an entry of R R^T from the identity. Poses written
             with six digits are within 1e-5; a scaled or sheared matrix is not within 1e-3.
+            Rounding to half precision is tolerated, too.
     """
     check_shapes(b_from_a=(b_from_a, "4 4"))
+    return _is_rigid(b_from_a, max(tolerance, 2 * torch.finfo(b_from_a.dtype).eps))
+
+
+@without_autocast
+def _is_rigid(b_from_a: Tensor, tolerance: float) -> Tensor:
     rotation = b_from_a[..., :3, :3]
     identity = torch.eye(4, device=b_from_a.device, dtype=b_from_a.dtype)
     orthogonal = ((rotation @ rotation.mT - identity[:3, :3]).abs() <= tolerance).all(-1).all(-1)

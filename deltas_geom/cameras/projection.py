@@ -1,24 +1,23 @@
 """World points to pixels and back."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.cameras.poses import invert_pose
-from deltas_geom.cameras.views import PosedViews
+from deltas_geom.cameras.poses import inverse_of_finite
+from deltas_geom.cameras.views import PosedViews, finite_intrinsics, finite_views
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
+from deltas_geom.records import Record
 
 
-class Projection(NamedTuple):
+class Projection(Record):
     """Where world points appear.
 
     Attributes:
         pixels: ``(*B, V, N, 2)``; (0, 0) with zero gradient where the point is not in front.
-        depth: ``(*B, V, N)`` along each camera's z axis, metres; 0 where the point is not
-            finite or too far to represent.
+        depth: ``(*B, V, N)`` along each camera's z axis, metres; 0 where the point or the camera
+            is not finite or the point too far to represent.
         in_front: ``(*B, V, N)`` bool: depth > 0, and the pixel and its gradient can be
             represented (a point closer to the camera's plane than that has no pixel).
     """
@@ -48,13 +47,12 @@ def project(views: PosedViews, points: Tensor) -> Projection:
         tensor([[[50., 45.]]])
     """
     check_shapes(points=(points, "N 3"))
-    batch_shape(views.check_shapes(), points.shape[:-2])
-    finite = points.isfinite().all(dim=-1)
-    # A NaN would reach the gradient of every camera through the product below.
-    known = torch.where(finite[..., None], points, 0.0)
-    known, proj = promoted(known, views.proj)
-    homogeneous = to_homogeneous(known).unsqueeze(-3) @ proj.mT
-    exists = finite.unsqueeze(-2) & homogeneous.isfinite().all(dim=-1)
+    views, posed, batch = finite_views(views)
+    batch_shape(batch, points.shape[:-2])
+    K, cam_from_world, points = promoted(*views, points)
+    known, finite = finite_or_zero(points)
+    homogeneous = to_homogeneous(known).unsqueeze(-3) @ (K @ cam_from_world[..., :3, :]).mT
+    exists = finite.unsqueeze(-2) & posed[..., None] & homogeneous.isfinite().all(dim=-1)
     depth = torch.where(exists, homogeneous[..., 2], 0.0)
     # Pixels and 1 / depth enter the gradient squared, times the size of the point.
     small = torch.finfo(depth.dtype).tiny ** (1 / 3)
@@ -74,18 +72,20 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
         depth: ``(*B, V, N)`` metres.
 
     Returns:
-        ``(*B, V, N, 3)`` world points, metres.
+        ``(*B, V, N, 3)`` world points, metres; (0, 0, 0) with zero gradient where the pixel, the
+        depth (as sensors mark it unknown) or the camera is not finite.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
-    batch = views.check_shapes()
+    views, posed, batch = finite_views(views)
     check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"), depth=(depth, "V N"))
     batch_shape(batch, pixels.shape[:-3], depth.shape[:-2])
     K, cam_from_world, pixels, depth = promoted(*views, pixels, depth)
-    rays = pixel_rays(K, pixels)
-    world_from_cam = invert_pose(cam_from_world)
-    return to_homogeneous(rays * depth[..., None]) @ world_from_cam[..., :3, :].mT
+    (pixels, seen), (depth, measured) = finite_or_zero(pixels), finite_or_zero(depth, 0)
+    points = rays_of_finite(K, pixels) * depth[..., None]
+    points = to_homogeneous(points) @ inverse_of_finite(cam_from_world)[..., :3, :].mT
+    return torch.where((seen & measured & posed[..., None])[..., None], points, 0.0)
 
 
 @without_autocast
@@ -97,13 +97,21 @@ def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
         pixels: ``(*B, N, 2)``.
 
     Returns:
-        ``(*B, N, 3)``; the last coordinate is 1.
+        ``(*B, N, 3)``; the last coordinate is 1. Where the pixel or the camera is not finite there
+        is no ray: (0, 0, 0), which passes no gradient and is no direction for whatever takes rays.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
     check_shapes(K=(K, "3 3"), pixels=(pixels, "N 2"))
     batch_shape(K.shape[:-2], pixels.shape[:-2])
+    K, pixels = promoted(K, pixels)
+    (K, known), (pixels, seen) = finite_intrinsics(K), finite_or_zero(pixels)
+    return torch.where((seen & known[..., None])[..., None], rays_of_finite(K, pixels), 0.0)
+
+
+def rays_of_finite(K: Tensor, pixels: Tensor) -> Tensor:
+    """:func:`pixel_rays` of what is finite, with focal lengths that are not 0."""
     # Back substitution: exact for a camera and cheaper than a general inverse.
     y = (pixels[..., 1] - K[..., 1, 2, None]) / K[..., 1, 1, None]
     x = (pixels[..., 0] - K[..., 0, 2, None] - K[..., 0, 1, None] * y) / K[..., 0, 0, None]

@@ -1,7 +1,7 @@
 """Posed views: intrinsics and poses of V cameras that look at one world."""
 
 import operator
-from typing import Any, NamedTuple, Self, SupportsIndex
+from typing import Self, SupportsIndex
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -9,11 +9,12 @@ from torch import Tensor
 
 from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
 from deltas_geom.cameras.poses import invert_pose, is_rigid
-from deltas_geom.checks import ShapeError, batch_shape, check_shapes
-from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.checks import ShapeError, batch_shape, check_shapes, check_tensor
+from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
+from deltas_geom.records import Record
 
 
-class PosedViews(NamedTuple):
+class PosedViews(Record):
     """V pinhole cameras; view 0 is the anchor, the others are its sources.
 
     Batch dims ``*B`` of K and cam_from_world broadcast, V does not: where all views share one K,
@@ -36,13 +37,23 @@ class PosedViews(NamedTuple):
     K: Tensor
     cam_from_world: Tensor
 
+    def __new__(cls, K: Tensor, cam_from_world: Tensor) -> Self:
+        """Refuse arrays and lists at once; what stands for tensors, as ``in_dims``, may be any."""
+        for name, value in (("K", K), ("cam_from_world", cam_from_world)):
+            if isinstance(value, list) or type(value).__name__ == "ndarray":
+                check_tensor(**{name: value})
+        return tuple.__new__(cls, (K, cam_from_world))
+
     @property
     @without_autocast
     def proj(self) -> Tensor:
-        """Projection matrices K [R | t], ``(*B, V, 3, 4)``, in the dtype to which both promote."""
-        self.check_shapes()
-        K, cam_from_world = promoted(*self)
-        return K @ cam_from_world[..., :3, :]
+        """Projection matrices K [R | t], ``(*B, V, 3, 4)``, in the dtype to which both promote.
+
+        That of a camera that is not finite is NaN, so that triangulation can tell.
+        """
+        (K, cam_from_world), finite, _ = finite_views(self)
+        K, cam_from_world = promoted(K, cam_from_world)
+        return torch.where(finite[..., None, None], K @ cam_from_world[..., :3, :], torch.nan)
 
     @property
     def num_views(self) -> int:
@@ -154,16 +165,12 @@ class PosedViews(NamedTuple):
         """The same cameras when their images are cropped: pixel (left, top) becomes (0, 0)."""
         return self._replace(K=crop_intrinsics(self.K, left=left, top=top))
 
-    def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Both tensors moved or cast as by :meth:`torch.Tensor.to`, with its arguments."""
-        return type(self)(*(tensor.to(*args, **kwargs) for tensor in self))
-
     def check_shapes(self) -> torch.Size:
         """``*B``, to which K and cam_from_world broadcast.
 
         Raises:
             ShapeError: a trailing shape differs, each has another V, or ``*B`` does not broadcast.
-            TypeError: not a tensor.
+            TypeError: not a tensor, or of integers.
         """
         return _check_shapes(self.K, self.cam_from_world, "cam_from_world")
 
@@ -176,7 +183,10 @@ class PosedViews(NamedTuple):
         of :meth:`check_shapes`. Apart from the operations because looking at values stalls an
         accelerator.
         """
-        self.check_shapes()
+        try:
+            self.check_shapes()
+        except TypeError as error:
+            raise ValueError(str(error)) from error
         focal = self.K.diagonal(dim1=-2, dim2=-1)[..., :2]
         lower = torch.stack([self.K[..., 1, 0], self.K[..., 2, 0], self.K[..., 2, 1]])
         if not bool(self.K.isfinite().all()) or not bool((focal > 0).all()):
@@ -185,6 +195,32 @@ class PosedViews(NamedTuple):
             raise ValueError("K must be upper triangular with K[2, 2] = 1")
         if not bool(is_rigid(self.cam_from_world).all()):
             raise ValueError("cam_from_world must hold finite rigid transforms (R orthogonal)")
+
+
+def finite_views(views: PosedViews) -> tuple[PosedViews, Tensor, torch.Size]:
+    """Cameras to compute with: an identity, without gradient, in place of what is not finite.
+
+    Returns:
+        Those cameras, which were finite ``(*B, V)`` bool, and ``*B``.
+
+    Raises:
+        ShapeError: as :meth:`PosedViews.check_shapes`.
+        TypeError: not posed views.
+    """
+    if not isinstance(views, PosedViews):
+        kind = type(views).__name__
+        raise TypeError(f"views must be PosedViews, got {kind}: use PosedViews(K, cam_from_world)")
+    batch = views.check_shapes()
+    (K, known), (poses, posed) = finite_intrinsics(views.K), finite_or_zero(views[1], dims=2)
+    return PosedViews(K, poses), known & posed, batch
+
+
+def finite_intrinsics(K: Tensor) -> tuple[Tensor, Tensor]:
+    """Intrinsics to divide by, an identity in place of what is no camera, and which are one."""
+    focal = K[..., 0, 0] * K[..., 1, 1]
+    known = (K.detach().abs().amax(dim=(-2, -1)) < torch.inf) & (focal.detach() != 0)
+    identity = torch.eye(3, device=K.device, dtype=K.dtype)
+    return torch.where(known[..., None, None], K, identity), known
 
 
 def _check_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:

@@ -4,10 +4,15 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.cameras.poses import relative_pose
-from deltas_geom.cameras.views import PosedViews
+from deltas_geom.cameras.poses import inverse_of_finite
+from deltas_geom.cameras.views import PosedViews, finite_views
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    at_least_in_single,
+    finite_or_zero,
+    promoted,
+    without_autocast,
+)
 
 
 def cross_matrix(vectors: Tensor) -> Tensor:
@@ -31,7 +36,7 @@ def inverse_intrinsics(K: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(K.shape)
 
 
-@without_autocast
+@at_least_in_single
 def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> Tensor:
     """Fundamental matrix F with x_source^T F x_anchor = 0 for pixels of one point.
 
@@ -42,7 +47,8 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
 
     Returns:
         ``(*B, 3, 3)``, F = K_s^-T [t]x R K_a^-1, not normalised: its scale follows the
-        baseline, and at zero baseline it is zero.
+        baseline, and at zero baseline it is zero, as with a camera that is not finite, then
+        without gradient. At least float32.
 
     Raises:
         ShapeError: shapes of the cameras do not go together.
@@ -50,14 +56,15 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
 
     Source: Hartley and Zisserman, 2nd ed., equation 9.2; the paper, section 3.2.
     """
-    views.check_shapes()
+    views, finite, _ = finite_views(views)
     K, cam_from_world = promoted(*views)
-    source_from_anchor = relative_pose(
-        cam_from_world[..., source, :, :], cam_from_world[..., anchor, :, :]
-    )
+    anchor_from_world, source_from_world = (cam_from_world[..., v, :, :] for v in (anchor, source))
+    source_from_anchor = source_from_world @ inverse_of_finite(anchor_from_world)
     essential = cross_matrix(source_from_anchor[..., :3, 3]) @ source_from_anchor[..., :3, :3]
     K_anchor, K_source = K[..., anchor, :, :], K[..., source, :, :]
-    return inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
+    fundamental = inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
+    both = finite[..., anchor] & finite[..., source]
+    return torch.where(both[..., None, None], fundamental, 0.0)
 
 
 @without_autocast
@@ -73,8 +80,8 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
         pixels: ``(*B, N, 2)`` in the first view. ``*B`` broadcasts.
 
     Returns:
-        ``(*B, N, 3)`` lines. A pixel within rounding of the epipole has none: its line is
-        zero and passes no gradient.
+        ``(*B, N, 3)`` lines. A pixel that is not finite or within rounding of the epipole has
+        none: its line is zero and passes no gradient.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
@@ -84,11 +91,12 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     check_shapes(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
     batch_shape(fundamental.shape[:-2], pixels.shape[:-2])
     fundamental, pixels = promoted(fundamental, pixels)
+    (fundamental, known), (pixels, seen) = finite_or_zero(fundamental, 2), finite_or_zero(pixels)
     lines = to_homogeneous(pixels) @ fundamental.mT
     size = lines[..., :2].detach().abs().amax(dim=-1, keepdim=True)
     scale = to_homogeneous(pixels).abs() @ fundamental[..., :2, :].abs().mT
     noise = 16 * torch.finfo(lines.dtype).eps * scale.amax(dim=-1, keepdim=True)
-    has_line = size > noise
+    has_line = (size > noise) & (seen & known[..., None])[..., None]
     # Divided by its size first, as the square of a short normal, to the power -3/2 in the
     # gradient, leaves the range of float32. Double where: no NaN from the unused branch.
     lines = safe_divide(lines, size, has_line)
@@ -106,11 +114,13 @@ def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Ten
         second: ``(*B, N, 2)`` pixels of the second view.
 
     Returns:
-        ``(*B, N)`` pixels; 0 where there is no line.
+        ``(*B, N)`` pixels; 0 with zero gradient where there is no line, or a pixel is not finite.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
     check_shapes(fundamental=(fundamental, "3 3"), first=(first, "N 2"), second=(second, "N 2"))
     batch_shape(fundamental.shape[:-2], first.shape[:-2], second.shape[:-2])
-    return (epipolar_lines(fundamental, first) * to_homogeneous(second)).sum(dim=-1)
+    second, seen = finite_or_zero(second)
+    distance = (epipolar_lines(fundamental, first) * to_homogeneous(second)).sum(dim=-1)
+    return torch.where(seen, distance, 0.0)

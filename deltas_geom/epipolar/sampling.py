@@ -1,7 +1,7 @@
 """Places along epipolar segments, and feature maps read at pixels."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -12,10 +12,16 @@ from deltas_geom.cameras.pixels import in_image, normalize_pixels
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_image_size, check_shapes
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import (
+    at_least_in_single,
+    finite_or_zero,
+    promoted,
+    without_autocast,
+)
+from deltas_geom.records import Record
 
 
-class Samples(NamedTuple):
+class Samples(Record):
     """Places in the sources where a keypoint may be matched.
 
     Attributes:
@@ -48,15 +54,28 @@ def sample_segments(
             itself. The paper uses (-1, 0, 1) against errors of the poses.
         image_size: (height, width); when given, offset samples outside are masked out.
 
+    Returns:
+        Samples. Those of a segment that is not visible, or not finite, are masked.
+
     Source: the paper, section 3.2.
     """
     if num_samples < 2:
         raise ValueError(f"num_samples must be at least 2, got {num_samples}")
-    start, end = segments.start, segments.end
+    check_shapes(
+        start=(segments.start, "S N 2"),
+        end=(segments.end, "S N 2"),
+        inv_depth_start=(segments.inv_depth_start, "S N"),
+        inv_depth_end=(segments.inv_depth_end, "S N"),
+        foreshortening=(segments.foreshortening, "S N"),
+    )
+    along = torch.stack(segments[2:4] + segments[5:], dim=-1)
+    known, sound = finite_or_zero(torch.cat([segments.start, segments.end, along], dim=-1))
+    start, end = known[..., :2], known[..., 2:4]
+    low, high, ratio = (known[..., place : place + 1] for place in (4, 5, 6))
     fraction = torch.linspace(0, 1, num_samples, device=start.device, dtype=start.dtype)
     # Homogeneous interpolation: with r the foreshortening, a share s of the inverse depth
     # lies at the share s r / (1 - s + s r) of the pixels.
-    ratio = segments.foreshortening[..., None]
+    ratio = torch.where(sound[..., None], ratio, 1.0)
     if spacing == "inv_depth":
         of_depth = fraction.expand(*ratio.shape[:-1], num_samples)
         of_pixels = of_depth * ratio / (1 - of_depth + of_depth * ratio)
@@ -65,7 +84,6 @@ def sample_segments(
         of_depth = of_pixels / (ratio * (1 - of_pixels) + of_pixels)
     else:
         raise ValueError(f"spacing must be 'inv_depth' or 'pixels', got {spacing!r}")
-    low, high = segments.inv_depth_start[..., None], segments.inv_depth_end[..., None]
     inv_depth = low + of_depth * (high - low)
     pixels = start[..., None, :] + of_pixels[..., None] * (end - start)[..., None, :]
 
@@ -79,7 +97,7 @@ def sample_segments(
         # Not torch.tensor, which copies numbers of the host to the device and waits for them.
         shifts = torch.stack([start.new_full((), offset) for offset in offsets])
         pixels = pixels + shifts[:, None, None] * across[..., None, None, :]
-    mask = segments.visible[..., None, None].expand(pixels.shape[:-1])
+    mask = (segments.visible & sound)[..., None, None].expand(pixels.shape[:-1])
     if image_size is not None:
         check_image_size(image_size)
         mask = mask & in_image(pixels, image_size=image_size)
@@ -95,7 +113,8 @@ def sample_inv_depths(
     Args:
         views: the anchor (view 0) and its V-1 sources.
         pixels: ``(*B, N, 2)`` keypoints of the anchor.
-        inv_depths: ``(S,)`` or ``(*B, N, S)``, 1/m of the anchor's z, not negative.
+        inv_depths: ``(S,)`` or ``(*B, N, S)``, 1/m of the anchor's z, not negative; what is not
+            finite counts as 0, masked.
         image_size: (height, width) of the sources.
 
     Returns:
@@ -108,17 +127,19 @@ def sample_inv_depths(
     check_image_size(image_size)
     check_shapes(pixels=(pixels, "N 2"), inv_depths=(inv_depths, "S"))
     rays = epipolar_rays(views, pixels)
-    inv_depth = inv_depths.unsqueeze(-3) if inv_depths.ndim > 1 else inv_depths
-    inv_depth = inv_depth.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depth.shape))
+    inv_depths, known = finite_or_zero(inv_depths, dims=0)
+    if inv_depths.ndim > 1:
+        inv_depths, known = inv_depths.unsqueeze(-3), known.unsqueeze(-3)
+    inv_depth = inv_depths.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depths.shape))
     homogeneous = rays.at(inv_depth)
     least = rays.clearance[..., None] + inv_depth.detach().abs() * rays.clearance_slope[..., None]
-    in_front = (homogeneous[..., 2] > least) & rays.usable[..., None]
+    in_front = (homogeneous[..., 2] > least) & rays.usable[..., None] & known
     where = safe_divide(homogeneous[..., :2], homogeneous[..., 2:], in_front[..., None])
     mask = in_front & in_image(where, image_size=image_size)
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
 
 
-@without_autocast
+@at_least_in_single
 def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     """Read a feature map of any stride at pixels of the image, bilinearly.
 
@@ -132,9 +153,9 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
         image_size: (height, width) of the image.
 
     Returns:
-        ``(*B, N, D)`` in the map's dtype, at least float32. A coordinate that is NaN or infinite
-        reads the border, NaN and minus infinity the left or upper one, with zero gradient to the
-        pixel.
+        ``(*B, N, D)``, at least float32. A coordinate that is NaN or infinite reads the border,
+        NaN and minus infinity the left or upper one, with zero gradient to the pixel. A number of
+        the map that is NaN or infinite counts as 0.
 
     Raises:
         ShapeError: a trailing shape differs, or the map is empty.
@@ -148,20 +169,9 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
     batch = batch_shape(feature_map.shape[:-3], pixels.shape[:-2])
     # The count, not -1: a reshape of no keypoints cannot infer it.
     count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]
-    maps = feature_map.expand(*batch, *size).reshape(count, *size)
-    grid = _grid(pixels, image_size=image_size).expand(*batch, num, 2).reshape(count, 1, num, 2)
-    dtype = torch.promote_types(maps.dtype, torch.float32)
-    read = F.grid_sample(maps.to(dtype), grid.to(dtype), padding_mode="border", align_corners=False)
+    maps, pixels = promoted(feature_map, pixels)
+    maps = maps.nan_to_num(0.0, 0.0, 0.0).expand(*batch, *size).reshape(count, *size)
+    grid = normalize_pixels(pixels, image_size=image_size)
+    grid = grid.expand(*batch, num, 2).reshape(count, 1, num, 2)
+    read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
     return read.squeeze(-2).mT.reshape(*batch, num, size[0])
-
-
-def _grid(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
-    """Pixels ``(*B, 2)`` as coordinates that `grid_sample` survives, in float32 at least.
-
-    The backward pass of grid_sample writes out of bounds at NaN (torch 2.13, on the CPU). Here
-    NaN is the border; what is not finite passes no gradient.
-    """
-    wide = pixels.to(torch.promote_types(pixels.dtype, torch.float32))
-    return normalize_pixels(wide, image_size=image_size).nan_to_num(
-        nan=-1.0, posinf=1.0, neginf=-1.0
-    )

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.cameras.poses import relative_pose
-from deltas_geom.cameras.projection import pixel_rays
-from deltas_geom.cameras.views import PosedViews
+from deltas_geom.cameras.poses import inverse_of_finite
+from deltas_geom.cameras.projection import rays_of_finite
+from deltas_geom.cameras.views import PosedViews, finite_views
 from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
 from deltas_geom.epipolar.fundamental import inverse_intrinsics
 from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.records import Record
 from deltas_geom.status import Status
 
 # A point counts as in front of the source if it lies before its plane by more than this power of
@@ -32,8 +33,9 @@ class EpipolarRays(NamedTuple):
     Attributes:
         origin: ``(*B, V-1, N, 3)`` homogeneous source pixel of the point at infinity.
         slope: ``(*B, V-1, 1, 3)`` K t, the homogeneous epipole, pixels times metres.
-        usable: ``(*B, 1, N)`` bool: the keypoint is finite and not so far out that it overflows;
-            if not, (0, 0) stands in for it.
+        usable: ``(*B, V-1, N)`` bool: the keypoint is finite and not so far out that it
+            overflows; if not, (0, 0) stands in for it; and both cameras are finite.
+        finite: ``(*B, V-1, N)`` bool: keypoint and cameras are.
         clearance: ``(*B, 1, N)``, and with inverse depth it grows by ``clearance_slope``: the
             homogeneous depth from which a point counts as in front. Without gradient.
         clearance_slope: ``(*B, V-1, 1)`` metres.
@@ -45,6 +47,7 @@ class EpipolarRays(NamedTuple):
     origin: Tensor
     slope: Tensor
     usable: Tensor
+    finite: Tensor
     clearance: Tensor
     clearance_slope: Tensor
     terms: Tensor
@@ -55,7 +58,7 @@ class EpipolarRays(NamedTuple):
         return self.origin[..., None, :] + inv_depth[..., None] * self.slope[..., None, :]
 
 
-class Segments(NamedTuple):
+class Segments(Record):
     """The visible part of every keypoint's epipolar line in every source.
 
     Attributes:
@@ -65,8 +68,8 @@ class Segments(NamedTuple):
         inv_depth_end: ``(*B, V-1, N)`` the same at the near end.
         status: ``(*B, V-1, N)`` int8 of :class:`Status`: OK; NO_PARALLAX where the segment is a
             point (``end`` is then ``start``, whatever the inverse depths); EMPTY where nothing of
-            the range is visible and NOT_FINITE_INPUT where the keypoint is not finite (ends and
-            inverse depths are then 0, with zero gradient).
+            the range is visible and NOT_FINITE_INPUT where the keypoint or a camera is not finite
+            (ends and inverse depths are then 0, with zero gradient).
         foreshortening: ``(*B, V-1, N)`` homogeneous depth at the near end over that at the
             far end; it tells how inverse depth runs between the two ends.
     """
@@ -94,17 +97,20 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     Raises:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
     """
-    batch = views.check_shapes()
+    views, posed, batch = finite_views(views)
     check_shapes(K=(views.K, "+V 3 3"), pixels=(pixels, "N 2"))
     batch_shape(batch, pixels.shape[:-2])
     K, cam_from_world, pixels = promoted(*views, pixels)
-    source_from_anchor = relative_pose(cam_from_world[..., 1:, :, :], cam_from_world[..., :1, :, :])
+    anchor_from_world = cam_from_world[..., :1, :, :]
+    source_from_anchor = cam_from_world[..., 1:, :, :] @ inverse_of_finite(anchor_from_world)
     K_source = K[..., 1:, :, :]
     # NaN is not below, either.
-    usable = (pixels.detach().abs() < torch.finfo(pixels.dtype).max ** 0.75).all(dim=-1)
+    size = pixels.detach().abs().amax(dim=-1)
+    usable = size < torch.finfo(pixels.dtype).max ** 0.75
     # A NaN would reach the gradient of every camera through the products below.
     known = torch.where(usable[..., None], pixels, 0.0)
-    rays = pixel_rays(K[..., 0, :, :], known).unsqueeze(-3)
+    rays = rays_of_finite(K[..., 0, :, :], known).unsqueeze(-3)
+    both = (posed[..., 1:] & posed[..., :1])[..., None]
     translation = source_from_anchor[..., :3, 3:]
     origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
     slope = (K_source @ translation).mT
@@ -122,7 +128,8 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     return EpipolarRays(
         origin,
         slope,
-        usable.unsqueeze(-2),
+        usable.unsqueeze(-2) & both,
+        (size < torch.inf).unsqueeze(-2) & both,
         clearance,
         clearance_slope,
         terms,
@@ -215,8 +222,7 @@ def epipolar_segments(
     a_point = still | (length <= 16 * torch.finfo(length.dtype).eps * max(height, width))
     status = torch.where(a_point, Status.NO_PARALLAX.value, Status.OK.value)
     status = torch.where(visible, status, Status.EMPTY.value)
-    finite = pixels.isfinite().all(dim=-1).unsqueeze(-2)
-    status = torch.where(finite, status, Status.NOT_FINITE_INPUT.value).to(torch.int8)
+    status = torch.where(rays.finite, status, Status.NOT_FINITE_INPUT.value).to(torch.int8)
     foreshortening = torch.where(
         visible, safe_divide(ends[..., 1, 2], ends[..., 0, 2], visible), 1.0
     )

@@ -1,8 +1,7 @@
 """Dot products of keypoint descriptors with feature maps, read at places of other views.
 
 Correlation comes first and the scalar map is sampled: bilinear reading is linear, so the result
-is that of reading D channels and then multiplying, at a fraction of the memory. Lengths of read
-features are not linear, but they are polynomials between the pixels and as cheap to read.
+is that of reading D channels and then multiplying, at a fraction of the memory.
 """
 
 from collections.abc import Callable
@@ -13,17 +12,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from deltas_geom.cameras.pixels import normalizing, resize_pixels
+from deltas_geom.cameras.pixels import normalizing
 from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.epipolar.sampling import Samples
-from deltas_geom.numerics.arithmetic import at_least_single, promoted, without_autocast
+from deltas_geom.matching.lengths import inverse_lengths, length_table
+from deltas_geom.numerics.arithmetic import at_least_in_single, at_least_single, promoted
 from deltas_geom.numerics.evaluation import recomputed
 
 _CACHED_ELEMENTS = 1 << 21  # a chunk should stay in the cache between writing and reading it
 _HELD_ELEMENTS = 1 << 28  # where there is no such cache: what one call may hold in memory
 
 
-@without_autocast
+@at_least_in_single
 def correlate(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:
@@ -41,8 +41,8 @@ def correlate(
 
     Returns:
         ``(*B, V-1, N, O, S)``; 0 with zero gradient where the sample is masked, whatever its
-        pixel holds; elsewhere a pixel that is NaN counts as one beyond the border. ``*B``
-        broadcasts. At least float32.
+        pixel holds; elsewhere a pixel that is NaN counts as one beyond the border. A number of a
+        feature that is NaN or infinite counts as 0. ``*B`` broadcasts. At least float32.
 
     Raises:
         ShapeError, TypeError: a trailing shape differs, a map is empty, the mask is not bool.
@@ -69,17 +69,18 @@ def correlate(
         pixels.shape[:-4],
         mask.shape[:-3],
     )
+    maps, rows = map(_Finite.apply, (feature_map, descriptors))
     return _in_pieces(
         lambda *piece: _DotProducts.apply(*piece, image_size),  # type: ignore[no-untyped-call]
-        feature_map.expand(*batch, *feature_map.shape[-3:]),
-        descriptors.unsqueeze(-3).expand(*batch, *descriptors.shape[-2:]),
+        maps.expand(*batch, *maps.shape[-3:]),
+        rows.unsqueeze(-3).expand(*batch, *rows.shape[-2:]),
         pixels.expand(*batch, *pixels.shape[-4:]),
         mask.expand(*batch, *pixels.shape[-4:-1]),
         elements=feature_map.shape[-2:].numel(),
     )
 
 
-@without_autocast
+@at_least_in_single
 def correlate_normalized(
     descriptors: Tensor, feature_map: Tensor, samples: Samples, *, image_size: tuple[int, int]
 ) -> Tensor:
@@ -113,10 +114,10 @@ def correlate_normalized(
         0.7071
     """
     dots = correlate(descriptors, feature_map, samples, image_size=image_size)
-    (table,) = recomputed(_length_table, feature_map)
+    (table,) = recomputed(length_table, feature_map)
     batch = batch_shape(feature_map.shape[:-3], samples.pixels.shape[:-4])
     scale = _in_pieces(
-        lambda *piece: recomputed(partial(_inverse_lengths, image_size=image_size), *piece)[0],
+        lambda *piece: recomputed(partial(inverse_lengths, image_size=image_size), *piece)[0],
         table.expand(*batch, *table.shape[-3:]),
         samples.pixels.expand(*batch, *samples.pixels.shape[-4:]),
         elements=samples.pixels.shape[-3:-1].numel() * 2 * table.shape[-3],
@@ -155,6 +156,25 @@ def _in_pieces(
     chunk = max(16, limit // held)
     chunks = zip(*(torch.split(tensor, chunk, dim=dim) for tensor in keypoints), strict=True)
     return torch.cat([function(maps, *some) for some in chunks], dim=dim)
+
+
+class _Finite(torch.autograd.Function):
+    """The same numbers, without gradient to those that count as 0, and no copy that is kept."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(numbers: Tensor) -> Tensor:
+        return numbers.view_as(numbers)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (numbers,) = ctx.saved_tensors
+        return torch.where(numbers.abs() < torch.inf, gradient, 0.0)
 
 
 class _DotProducts(torch.autograd.Function):
@@ -220,6 +240,8 @@ def _in_full(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Features ``(*B, D, h w)``, descriptors, grid ``(*B n, O, S, 2)`` in float32 at least."""
     features, descriptors = promoted(at_least_single(features), descriptors)
+    # A NaN would be in all products with it: of a zero gradient, too.
+    features, descriptors = (x.nan_to_num(0.0, 0.0, 0.0) for x in (features, descriptors))
     pixels = at_least_single(pixels)
     # One pass along rows of x, y, x, y: four, two numbers wide, take as long as the sampling.
     count = pixels.shape[-2]
@@ -239,61 +261,3 @@ def _masked(values: Tensor, mask: Tensor) -> Tensor:
     # bits of a number are kept, or none.
     bits = torch.int32 if values.dtype == torch.float32 else torch.int64
     return (values.view(bits) & mask.to(bits).neg_()).view(values.dtype)
-
-
-def _length_table(feature_map: Tensor) -> tuple[Tensor]:
-    """What the squared length of a read feature consists of, ``(*B, 9, h, w)``.
-
-    Between a and b it is (1-u) |a|^2 + u |b|^2 - u (1-u) |a - b|^2. Twice, along x and along y,
-    that is a polynomial of 3 x 3 terms, here for the cell right of and below each pixel, y
-    first. Differences, not the products of neighbours: maps are smooth, and small differences
-    keep their digits.
-    """
-
-    def right(values: Tensor) -> Tensor:
-        return torch.cat([values[..., 1:], values[..., -1:]], dim=-1)
-
-    def below(values: Tensor) -> Tensor:
-        return torch.cat([values[..., 1:, :], values[..., -1:, :]], dim=-2)
-
-    def squared(values: Tensor) -> Tensor:
-        return values.square().sum(dim=-3)
-
-    features = at_least_single(feature_map)
-    along = right(features) - features
-    length, step_x, step_y = squared(features), squared(along), squared(below(features) - features)
-    twist = squared(below(along) - along)
-    of_top = [length, right(length), step_x]
-    of_bottom = [below(value) for value in of_top]
-    return (torch.stack([*of_top, *of_bottom, step_y, right(step_y), twist], dim=-3),)
-
-
-def _inverse_lengths(
-    table: Tensor, pixels: Tensor, *, image_size: tuple[int, int]
-) -> tuple[Tensor]:
-    """One by the length of the feature at pixels ``(*B, n, O, S, 2)``; 0 where it is nothing."""
-    size = (table.shape[-2], table.shape[-1])
-    places = resize_pixels(at_least_single(pixels), old_size=image_size, new_size=size)
-    places = places.to(table.dtype)
-    x, column = _cell(places[..., 0].flatten(-3), size[1])
-    y, row = _cell(places[..., 1].flatten(-3), size[0])
-    cell = (row * size[1] + column).unsqueeze(-2).expand(*table.shape[:-2], -1)
-    terms = table.flatten(-2).gather(-1, cell)
-    terms = terms.reshape(*terms.shape[:-2], 3, 3, terms.shape[-1])
-    of_x = torch.stack([1 - x, x, x * (x - 1)], dim=-2).unsqueeze(-3)
-    of_y = torch.stack([1 - y, y, y * (y - 1)], dim=-2)
-    squared = ((terms * of_x).sum(dim=-2) * of_y).sum(dim=-2)
-    with torch.no_grad():
-        ends = (terms[..., :2, :2, :] * of_x[..., :2, :]).sum(dim=-2) * of_y[..., :2, :]
-        has_length = squared > 16 * torch.finfo(squared.dtype).eps * ends.sum(dim=-2)
-    # Double where: the unused branch must not turn the gradient into NaN.
-    inverse = torch.where(has_length, torch.where(has_length, squared, 1.0).rsqrt(), 0.0)
-    return (inverse.reshape(pixels.shape[:-1]),)
-
-
-def _cell(place: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Share of the way to the next centre, and the index of the centre before it."""
-    inside = (place > 0) & (place < size - 1)
-    place = torch.where(inside, place, place.detach().clamp(0, size - 1).nan_to_num(0.0))
-    before = place.detach().floor()
-    return place - before, before.long()

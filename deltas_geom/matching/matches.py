@@ -5,8 +5,6 @@ evidence of all sources at common inverse depths before it decides, so that one 
 one view cannot pull the point away.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -14,10 +12,11 @@ from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import check_bool, check_shapes
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, without_autocast
+from deltas_geom.records import Record
 
 
-class Matches(NamedTuple):
+class Matches(Record):
     """Where keypoints of the anchor are seen; ready for :func:`deltas_geom.triangulate`.
 
     Attributes:
@@ -37,7 +36,7 @@ class Matches(NamedTuple):
     mask: Tensor
 
 
-class SoftArgmax(NamedTuple):
+class SoftArgmax(Record):
     """The mean place of a distribution over places, and how sure it is.
 
     Attributes:
@@ -64,7 +63,8 @@ def soft_argmax(
     Args:
         logits: ``(*B, S)``. What is not finite, such as the -inf that often marks masked places,
             counts as masked.
-        positions: ``(*B, S, D)`` or broadcastable, for example pixels or inverse depths.
+        positions: ``(*B, S, D)`` or broadcastable, for example pixels or inverse depths. What is
+            not finite counts as masked.
         mask: ``(*B, S)`` bool, True = possible; the others may hold anything.
         window: keep only places at most this many steps (0 or more) from the peak, so that a
             second mode elsewhere does not pull the mean between the two.
@@ -88,7 +88,8 @@ def soft_argmax(
     check_bool(mask=mask)
     if window is not None and window < 0:
         raise ValueError(f"window must not be negative, got {window}")
-    possible = logits.isfinite() if mask is None else mask & logits.isfinite()
+    positions, known = finite_or_zero(positions)
+    possible = logits.isfinite() & known if mask is None else mask & logits.isfinite() & known
     lowest = torch.finfo(logits.dtype).min / 4
     probability = torch.where(possible, logits, lowest).softmax(dim=-1)
     probability = torch.where(possible, probability, 0.0)
@@ -100,7 +101,7 @@ def soft_argmax(
         near = torch.where((index - place[..., None]).abs() <= window, probability, 0.0)
     mass = near.sum(dim=-1)
     share = safe_divide(near, mass[..., None], (mass > 0)[..., None])
-    positions = torch.where(possible[..., None], positions, 0.0)
+    positions = torch.where(possible[..., None], positions, 0.0)  # far ones, to the square
     position = (share[..., None] * positions).sum(dim=-2)
     offset = positions - position.unsqueeze(-2)
     covariance = (share[..., None] * offset).mT @ offset
@@ -112,6 +113,8 @@ def matches_from_sources(
 ) -> Matches:
     """Put the anchor's keypoints (weight 1, no covariance) before the sources' matches.
 
+    A keypoint that is not finite is no match.
+
     Args:
         keypoints: ``(*B, N, 2)``.
         pixels: ``(*B, V-1, N, 2)``.
@@ -120,13 +123,14 @@ def matches_from_sources(
         mask: ``(*B, V-1, N)``.
     """
     batch = weights.shape[:-2]
+    keypoints, known = finite_or_zero(keypoints)
     anchor = keypoints.expand(*batch, *keypoints.shape[-2:]).unsqueeze(-3)
     ones = torch.ones_like(weights[..., :1, :])
     return Matches(
         torch.cat([anchor, pixels], dim=-3),
         torch.cat([ones, weights], dim=-2),
         torch.cat([torch.zeros_like(covariance[..., :1, :, :, :]), covariance], dim=-4),
-        torch.cat([torch.ones_like(mask[..., :1, :]), mask], dim=-2),
+        torch.cat([known.expand_as(mask[..., 0, :]).unsqueeze(-2), mask], dim=-2),
     )
 
 
@@ -184,6 +188,7 @@ def match_per_view(
 
     Source: the paper, section 3.2, equations 2 and 3.
     """
+    check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N O M"))
     if window is not None and scores.shape[-2] != 1:
         raise ValueError("window needs samples without offsets: steps are along one line")
     found = soft_argmax(
@@ -226,6 +231,7 @@ def match_joint(
         The projections of the one decided depth into the sources that can see it, weight =
         peak of the joint distribution.
     """
+    check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N 1 M"))
     check_bool(mask=samples.mask)
     scores = scores.squeeze(-2)
     seen = samples.mask.squeeze(-2) & scores.isfinite()

@@ -1,14 +1,17 @@
-"""The precision that arguments are worked on in: their own, never less."""
+"""The precision that arguments are worked on in, and numbers that are none."""
 
-from collections.abc import Callable, Iterable
-from functools import reduce, wraps
-from typing import ParamSpec, TypeVar
+from collections.abc import Callable
+from functools import partial, reduce, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
+from deltas_geom.records import mapped, tensors_of
+
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+_HALF = (torch.float16, torch.bfloat16)
 
 
 def promoted(*tensors: Tensor) -> tuple[Tensor, ...]:
@@ -29,33 +32,74 @@ def at_least_single(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
-def without_autocast(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Keep ``torch.autocast`` out of an operation: it computes in the dtypes of its arguments.
+def finite_or_zero(tensor: Tensor, dims: int = 1) -> tuple[Tensor, Tensor]:
+    """The items that are finite, 0 without gradient in place of others, and which are.
 
-    Autocast multiplies matrices in half precision. In bfloat16 a pixel at 600 is known to 4 px, and
-    triangulation by cameras so rounded takes good points as at infinity.
+    An operation that takes these, and puts its own 0 where the item is not finite, has a finite
+    value there and passes nothing: a NaN would be in the product of a zero gradient with it, and
+    so in the gradient of every camera that the item shares with others.
+
+    Args:
+        tensor: ``(*B, ...)``, an item being its last ``dims`` dims.
+        dims: 0 if an item is one number.
+
+    Example:
+        >>> finite_or_zero(torch.tensor([[torch.nan, 1.0], [2.0, 3.0]]))
+        (tensor([[0., 0.],
+                [2., 3.]]), tensor([False,  True]))
     """
+    size = tensor.detach().abs()
+    # NaN is not below infinity either, and the largest of numbers and NaN is NaN.
+    finite = (size.amax(dim=tuple(range(-dims, 0))) if dims else size) < torch.inf
+    return torch.where(finite[(..., *[None] * dims)], tensor, 0.0), finite
 
+
+def without_autocast(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Compute in the dtypes of the arguments, in float32 where these are of half precision.
+
+    ``torch.autocast`` is kept out: it multiplies matrices in half precision. In bfloat16 a pixel
+    at 600 is known to 4 px, and triangulation by cameras so rounded takes good points as at
+    infinity. Results are in the dtype to which the arguments promote; where that is of half
+    precision they are rounded to it, and numbers beyond its range to the largest of it.
+    """
+    return _called(operation, rounds=True)
+
+
+def at_least_in_single(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """:func:`without_autocast`, but results stay in float32: half precision cannot hold them."""
+    return _called(operation, rounds=False)
+
+
+def _called(
+    operation: Callable[_Arguments, _Result], *, rounds: bool
+) -> Callable[_Arguments, _Result]:
     @wraps(operation)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        device = _device_type((*args, *kwargs.values()))
+        tensors = tensors_of((*args, *kwargs.values()))
+        kind = tensors[0].device.type if tensors else "meta"
         # Asked first: an exported program that holds a region without autocast cannot be loaded.
-        if device is None or not torch.is_autocast_enabled(device):
+        if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
+            with torch.autocast(kind, enabled=False):
+                return called(*args, **kwargs)
+        if not any(tensor.dtype in _HALF for tensor in tensors):
             return operation(*args, **kwargs)
-        with torch.autocast(device, enabled=False):
-            return operation(*args, **kwargs)
+        options: Any = {name: mapped(_widened, value) for name, value in kwargs.items()}
+        result = operation(*mapped(_widened, args), **options)
+        kinds = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]
+        dtype = reduce(torch.promote_types, kinds)
+        half = rounds and dtype in _HALF
+        return mapped(partial(_rounded, dtype=dtype), result) if half else result
 
     return called
 
 
-def _device_type(values: Iterable[object]) -> str | None:
-    """Of the first tensor, also in tuples of tensors; None if its device has no autocast."""
-    for value in values:
-        if isinstance(value, Tensor):
-            kind: str = value.device.type
-            return kind if torch.amp.is_autocast_available(kind) else None
-        if isinstance(value, tuple):
-            found = _device_type(value)
-            if found is not None:
-                return found
-    return None
+def _widened(tensor: Tensor) -> Tensor:
+    return at_least_single(tensor) if tensor.dtype in _HALF else tensor
+
+
+def _rounded(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    if not tensor.is_floating_point():
+        return tensor
+    largest = torch.finfo(dtype).max
+    kept = tensor.abs() == torch.inf  # what an item that is not finite holds, as NaN
+    return torch.where(kept, tensor, tensor.clamp(-largest, largest)).to(dtype)

@@ -1,15 +1,14 @@
 """Triangulated points, and what is known about each."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_bool, check_depth_range, check_shapes
+from deltas_geom.records import Record
 from deltas_geom.status import Status
 
 
-class Triangulation(NamedTuple):
+class Triangulation(Record):
     """Triangulated points and what is known about them.
 
     Attributes:
@@ -73,7 +72,7 @@ class Triangulation(NamedTuple):
         return _without(self, outside)
 
 
-class RobustTriangulation(NamedTuple):
+class RobustTriangulation(Record):
     """The fields of :class:`Triangulation`, of the inliers, and which views those are.
 
     Attributes:
@@ -98,17 +97,10 @@ class RobustTriangulation(NamedTuple):
 
     def within_depth(self, depth_range: tuple[float, float]) -> "RobustTriangulation":
         """As :meth:`Triangulation.within_depth`, the range being that of every inlier."""
-        found = Triangulation(
-            self.points,
-            self.depth,
-            self.status,
-            self.valid,
-            self.residual,
-            self.parallax,
-            self.covariance,
-        )
+        found = Triangulation(*self[:-1])
         kept = found.within_depth(depth_range, used=self.inliers)
-        return RobustTriangulation(*kept, self.inliers & kept.valid.unsqueeze(-2))
+        inliers = self.inliers & kept.valid.unsqueeze(-2)
+        return RobustTriangulation(**kept._asdict(), inliers=inliers)
 
 
 def _beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:

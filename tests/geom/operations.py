@@ -112,7 +112,7 @@ OPERATIONS: dict[str, Operation] = {
     "invert_pose": lambda g: geom.invert_pose(g.views.cam_from_world),
     "is_rigid": lambda g: geom.is_rigid(g.views.cam_from_world),
     "match_joint": lambda g: geom.match_joint(
-        g.views, g.keypoints, g.scores[0, :, 0], g.at_depths, image_size=SIZE
+        g.views, g.keypoints, g.scores[:, :, :1], g.at_depths, image_size=SIZE
     ),
     "match_per_view": lambda g: geom.match_per_view(g.keypoints, g.scores, g.beside_lines),
     "normalize_pixels": lambda g: geom.normalize_pixels(g.pixels, image_size=SIZE),

@@ -16,9 +16,9 @@ from deltas_geom import (
     ShapeError,
     correlate,
     correlate_normalized,
-    correlation,
     sample_map,
 )
+from deltas_geom.matching import correlation
 from deltas_geom.testing.strategies import image_pixels, vectors
 
 SIZE = (24, 32)  # of the image, px; the map has stride 4
