@@ -66,12 +66,22 @@ def _in_words(box: str) -> str:
     """What tyro draws a box for, as a line.
 
     The line leaves out the title, which the text below repeats, and the last part, which points to
-    --help.
+    --help. Where standard output knows no box, rules of hyphens stand between the parts.
     """
-    inside = [line for line in box.splitlines() if not line.startswith(("╭", "╰"))]
-    plain = re.sub(r"\[/?bold\]|│", " ", " ".join(inside))
-    parts = [" ".join(part.split()) for part in re.split("─{3,}", plain)]
+    lines = [re.sub(r"\[/?bold\]|│", " ", line) for line in box.splitlines()]
+    if box.lstrip().startswith("╭"):
+        lines = [line for line in lines if not line.startswith(("╭", "╰"))]
+    else:
+        lines = lines[1:]
+    parts = [" ".join(part.split()) for part in re.split("[─-]{3,}", " ".join(lines))]
     said = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
+    # An option that may be left out: tyro tells what went wrong with each of its types.
+    said = re.sub(
+        r"no type matching \{None\}\|\{(.+?)\} could be instantiated from (\[.*?\])\."
+        r" Got errors: [^;]*",
+        r"\1 expected, got \2",
+        said,
+    )
     # What a config, or one inside it, refused comes with tyro's or Python's name for where it is.
     return re.sub(r"^Error parsing (__tyro\S+|[A-Z]\w+:) ", "", said)
 

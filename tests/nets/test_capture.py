@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from small_capture import FAULTS, K_FILE
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
@@ -114,94 +115,17 @@ def test_an_unknown_frame_names_the_nearest(capture: Capture) -> None:
     line_of(error, "no frame 99", str(capture.path), "0, 1, 2, 3")
 
 
-def write_to(name: str, content: str | bytes) -> Callable[[Path], None]:
-    raw = content if isinstance(content, bytes) else content.encode()
-
-    def edit(folder: Path) -> None:
-        (folder / name).write_bytes(raw)
-
-    return edit
-
-
-def edit_pose(content: str | bytes) -> Callable[[Path], None]:
-    return write_to("pose/1.txt", content)
-
-
-def edit_intrinsics(content: str) -> Callable[[Path], None]:
-    return write_to("intrinsic/intrinsic_color.txt", content)
-
-
-def remove(name: str) -> Callable[[Path], None]:
-    def edit(folder: Path) -> None:
-        path = folder / name
-        path.rename(folder.parent / "elsewhere")
-
-    return edit
-
-
-def twice(folder: Path) -> None:
-    Image.new("RGB", (64, 48)).save(folder / "color" / "01.png")
-
-
-def empty_color(folder: Path) -> None:
-    for path in (folder / "color").iterdir():
-        path.unlink()
-
-
-def other_numbers(folder: Path) -> None:
-    for path in list((folder / "pose").iterdir()):
-        path.rename(path.with_name(f"9{path.name}"))
-
-
-def all_lost(folder: Path) -> None:
-    for path in (folder / "pose").iterdir():
-        path.write_text("nan " * 16)
-
-
-def no_images(folder: Path) -> None:
-    for path in (folder / "color").iterdir():
-        path.write_bytes(b"")
-
-
-POSE, K_FILE = "pose/1.txt", "intrinsic/intrinsic_color.txt"
-IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
-FAULTS = {
-    "no color": (remove("color"), "", "no folder color"),
-    "no pose folder": (remove("pose"), "", "no folder pose"),
-    "empty color": (empty_color, "color", "no numbered images"),
-    "two files a frame": (twice, "color", "frame 1 (01.png and 1.jpg)"),
-    "no pose belongs": (other_numbers, "pose", "no pose belongs to an image"),
-    "all poses lost": (all_lost, "pose", "every pose is lost"),
-    "no image decodes": (no_images, "color/0.jpg", "can be decoded"),
-    "pose of 12": (edit_pose("1 " * 12), POSE, "12 numbers, not 16"),
-    "empty pose": (edit_pose(""), POSE, "0 numbers, not 16"),
-    "pose of words": (edit_pose("hello world"), POSE, "'hello'"),
-    "binary pose": (edit_pose(b"\xff\xfe\x00\x80"), POSE, "not text"),
-    "scaled pose": (edit_pose(IDENTITY.replace("1 0 0 0 0", "1.1 0 0 0 0", 1)), POSE, "not rigid"),
-    "zero pose": (edit_pose("0 " * 15 + "1"), POSE, "not rigid"),
-    "mirrored pose": (edit_pose("-" + IDENTITY), POSE, "mirrors"),
-    "last row": (edit_pose(IDENTITY[:-1] + "2"), POSE, "last row"),
-    "no intrinsics": (remove(K_FILE), K_FILE, "missing"),
-    "intrinsics of 12": (edit_intrinsics("1 " * 12), K_FILE, "12 numbers"),
-    "intrinsics of words": (edit_intrinsics("fx fy"), K_FILE, "'fx'"),
-    "infinite intrinsics": (edit_intrinsics("nan 0 32 0 9 24 0 0 1"), K_FILE, "not finite"),
-    "negative focal": (edit_intrinsics("-9 0 32 0 9 24 0 0 1"), K_FILE, "not positive"),
-    "transposed K": (edit_intrinsics("9 0 0 0 9 0 32 24 1"), K_FILE, "not a camera matrix"),
-    "larger images' K": (edit_intrinsics("90 0 65 0 90 48 0 0 1"), K_FILE, "another resolution"),
-    "smaller images' K": (edit_intrinsics("9 0 16 0 9 12 0 0 1"), K_FILE, "another resolution"),
-}
-
-
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_broken_capture_is_one_line_that_names_the_file(
     make_capture: MakeCapture, name: str
 ) -> None:
-    edit, where, what = FAULTS[name]
+    break_it, where = FAULTS[name]
     folder = make_capture()
-    edit(folder)
+    break_it(folder)
     with pytest.raises(UserError) as error:
         open_capture(folder)
-    line_of(error, str(folder / where), what)
+    assert error.value.where == folder / where
+    line_of(error)
 
 
 def test_a_path_that_is_no_capture_says_what_one_is(tmp_path: Path) -> None:
@@ -221,9 +145,9 @@ def test_a_path_that_is_no_capture_says_what_one_is(tmp_path: Path) -> None:
 
 def test_a_three_by_three_is_as_good_as_four_by_four(make_capture: MakeCapture) -> None:
     folder = make_capture()
-    edit_intrinsics("60 0 32 0 0 60 24 0 0 0 1 0 0 0 0 1")(folder)
+    (folder / K_FILE).write_text("60 0 32 0 0 60 24 0 0 0 1 0 0 0 0 1")
     four = open_capture(folder).frame(0).K
-    edit_intrinsics("60 0 32 0 60 24 0 0 1")(folder)
+    (folder / K_FILE).write_text("60 0 32 0 60 24 0 0 1")
     assert np.array_equal(four, open_capture(folder).frame(0).K)
 
 

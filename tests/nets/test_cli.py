@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -221,63 +219,9 @@ def test_lost_poses_are_left_out_with_one_warning(
     assert json.loads((out / "summary.json").read_text())["lost_poses"] == [2]
 
 
-def break_pose(folder: Path) -> None:
-    (folder / "pose" / "1.txt").write_text("nan " * 16)
-
-
-def cut_image(folder: Path) -> None:
-    file = folder / "color" / "1.jpg"
-    file.write_bytes(file.read_bytes()[:-400])
-
-
-def drop_poses(folder: Path) -> None:
-    for file in (folder / "pose").iterdir():
-        file.unlink()
-    (folder / "pose").rmdir()
-
-
-def shrink_intrinsics(folder: Path) -> None:
-    (folder / "intrinsic" / "intrinsic_color.txt").write_text("1 2 3")
-
-
-@pytest.mark.parametrize(
-    ("damage", "file", "remedy"),
-    [
-        (break_pose, "pose/1.txt", "repair it"),
-        (cut_image, "color/1.jpg", "copy the file again"),
-        (drop_poses, "capture", "put a 4x4"),
-        (shrink_intrinsics, "intrinsic_color.txt", "write the 4x4"),
-    ],
-)
-def test_a_bad_capture_is_one_line_and_nothing_is_written(
-    run: Run,
-    make_capture: MakeCapture,
-    tmp_path: Path,
-    damage: Callable[[Path], None],
-    file: str,
-    remedy: str,
-) -> None:
-    capture, sets, out = make_capture(), tmp_path / "sets.json", tmp_path / "out"
-    sets.write_text('[{"anchor": 0, "sources": [1, 2]}]')
-    damage(capture)
-    assert_one_line(run("depth", capture, "--out", out, "--view-sets", sets), file, remedy)
-    assert not out.exists()
-
-
-def test_wrong_options_are_one_line(run: Run, make_capture: MakeCapture, tmp_path: Path) -> None:
-    capture, out = make_capture(), tmp_path / "out"
-    base = ["depth", capture, "--out", out]
-    assert_one_line(run("depth", tmp_path / "none", "--out", out), "none", "check the path")
-    assert_one_line(run(*base, "--weights", "nope"), "nope", "deltas-small")
-    assert_one_line(run(*base, "--device", "toaster"), "--device toaster", "use cpu")
-    assert_one_line(run(*base, "--depth-range", 3, 1), "--depth-range", "NEAR < FAR")
-    assert_one_line(run(*base, "--shard", "3/2"), "--shard 3/2", "I/N")
-    assert_one_line(run(*base, "--views", 1), "--views 1", "2 or more")
-    assert_one_line(run(*base, "--size", 4, 4), "--size", "32 or more")
-    assert_one_line(run(*base, "--size", 100), "see deltas depth --help")
-    assert_one_line(run(*base, "--vews", 3), "--vews", "see deltas depth --help")
-    assert_one_line(run("dept"), "see deltas --help")
-    assert not out.exists()
+def test_a_device_that_is_none_is_one_line(run: Run, make_capture: MakeCapture) -> None:
+    told = run("depth", make_capture(), "--out", "out", "--device", "toaster")
+    assert_one_line(told, "--device toaster", "use cpu")
 
 
 def test_what_a_config_refuses_is_said_in_its_own_words(run: Run, tmp_path: Path) -> None:
@@ -289,13 +233,6 @@ def test_what_a_config_refuses_is_said_in_its_own_words(run: Run, tmp_path: Path
         told = run("train", "--out", tmp_path / "run", *options)
         assert_one_line(told, f"deltas: {words}, command line: see deltas train --help")
     assert not (tmp_path / "run").exists()
-
-
-def test_a_file_is_no_output_folder(run: Run, make_capture: MakeCapture, tmp_path: Path) -> None:
-    taken = tmp_path / "taken"
-    taken.write_text("mine")
-    assert_one_line(run("depth", make_capture(), "--out", taken), "taken", "--out")
-    assert taken.read_text() == "mine"
 
 
 def test_debug_shows_the_traceback(run: Run, tmp_path: Path) -> None:
@@ -383,11 +320,6 @@ def test_the_version_is_told(run: Run) -> None:
     from deltas_nets import __version__
 
     assert run("--version").out == f"deltas-depth {__version__}\n"
-
-
-def test_help_does_not_wait_for_torch() -> None:
-    code = "import sys, deltas_nets.cli; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_cost_prints_every_stage_and_writes_json(run: Run, tmp_path: Path) -> None:

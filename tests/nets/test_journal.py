@@ -84,19 +84,6 @@ def test_overwriting_forgets_the_records(tmp_path: Path) -> None:
     assert frames_of(tmp_path) == {} and record_files(tmp_path) == []
 
 
-def test_shards_of_which_none_runs_are_stopped(tmp_path: Path) -> None:
-    def status() -> str:
-        return str(json.loads((tmp_path / "summary.json").read_text())["status"])
-
-    first, second = (prepare_output(tmp_path, settings=SETTINGS, shard=(i, 2)) for i in (1, 2))
-    first.write_summary("stopped")
-    assert status() == "running"
-    second.write_summary("complete")
-    assert status() == "stopped"
-    first.write_summary("complete")
-    assert status() == "complete"
-
-
 def test_sigterm_stops_a_run_as_ctrl_c_does(
     run: Run, make_capture: MakeCapture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

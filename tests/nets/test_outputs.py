@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +14,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from small_output import summary_of, write_frame
+from small_output import output_of, summary_of, write_frame
 
 from deltas_nets.errors import UserError
+from deltas_nets.outputs import folder as output_folder
+from deltas_nets.outputs import products
 from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.outputs.folder import prepare_output
 from deltas_nets.outputs.products import (
+    FrameOutput,
+    OutputOptions,
+    check_depth_fits,
     read_depth_png,
     read_points_ply,
     write_confidence_png,
@@ -59,6 +65,77 @@ def test_confidence_is_rounded_to_8_bits(tmp_path: Path) -> None:
     with Image.open(tmp_path / "c.png") as image:
         assert image.mode == "L"
         assert np.asarray(image).tolist() == [[0, 128, 255, 255, 0, 0]]
+
+
+@given(scale=st.floats(1e-3, 1e5), part=st.floats(0.001, 1))
+def test_another_scale_holds_other_depths(
+    scale: float, part: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path, options = tmp_path_factory.getbasetemp() / "s.png", OutputOptions(depth_scale=scale)
+    metres = part * options.max_depth
+    write_depth_png(path, np.full((2, 3), metres), scale=scale)
+    assert read_depth_png(path, scale=scale) == pytest.approx(metres, abs=0.51 / scale, rel=1e-6)
+    check_depth_fits((metres / 2, metres), options)
+    with pytest.raises(UserError) as error:
+        check_depth_fits((metres, 1.01 * options.max_depth), options)
+    told = re.search(r"--depth-scale (\S+) ", error.value.remedy)
+    assert told is not None
+    # What is proposed holds twice the range, and no more than that by far.
+    assert 2 <= OutputOptions(depth_scale=float(told[1])).max_depth / options.max_depth < 5
+    check_depth_fits((1, np.inf), options)
+
+
+def test_pixels_too_far_for_the_file_are_counted(tmp_path: Path) -> None:
+    depth = np.array([[1.0, 65.534, 65.6, 900], [0, np.nan, np.inf, 2]])
+    folder = prepare_output(tmp_path, settings=SETTINGS)
+    folder.write_frame(output_of("7", depth=depth), {"status": "ok"})
+    write_frame(folder, "8")
+    folder.write_summary("complete")
+    frames = summary_of(tmp_path)["frames"]
+    assert frames["7"] == {"status": "ok", "saturated_pixels": 2}
+    assert "saturated_pixels" not in frames["8"]
+
+
+def test_surveyed_coordinates_keep_their_digits(tmp_path: Path) -> None:
+    points = np.array([441547.5, 5121946.5, 312.0]) + np.random.default_rng(0).random((99, 3))
+    write_points_ply(tmp_path / "p.ply", points, np.zeros((99, 3), np.uint8))
+    assert np.array_equal(read_points_ply(tmp_path / "p.ply")[0], points)
+    near = points - points.mean(axis=0)
+    write_points_ply(tmp_path / "p.ply", near, np.zeros((99, 3), np.uint8))
+    assert np.array_equal(read_points_ply(tmp_path / "p.ply")[0], near.astype(np.float32))
+
+
+def test_a_product_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything that the folder does with its files follows from the table."""
+
+    def write(path: Path, frame: FrameOutput, options: OutputOptions) -> None:
+        path.write_text(frame.anchor.id)
+
+    rows = (*products.PRODUCTS, products.Product("names", ".txt", write))
+    for module in (products, output_folder):
+        monkeypatch.setattr(module, "PRODUCTS", rows)
+    folder = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"])
+    write_frame(folder, "1")
+    file = folder.file("names", "1")
+    assert file == tmp_path / "names" / "1.txt" and file.read_text() == "1"
+    assert summary_of(tmp_path)["files"] == ["depth", "confidence", "points", "names"]
+    file.unlink()
+    assert not folder.is_finished("1")
+    (tmp_path / "names" / ".1.txt.x7.deltas-tmp").write_bytes(b"half")
+    folder = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"])
+    assert list((tmp_path / "names").iterdir()) == []
+    write_frame(folder, "1")
+    prepare_output(tmp_path, settings=SETTINGS, overwrite=True)
+    assert not file.exists()
+
+
+def test_a_confidence_is_written_where_there_is_one(tmp_path: Path) -> None:
+    silent = OutputOptions(confidence=False)
+    folder = prepare_output(tmp_path, settings=SETTINGS, options=silent)
+    with pytest.raises(ValueError, match="confidence=False"):
+        write_frame(folder, "1")
+    folder.write_frame(output_of("1", confidence=None), {"status": "ok"})
+    assert folder.is_finished("1") and not (tmp_path / "confidence").exists()
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
@@ -154,10 +231,8 @@ def test_other_settings_are_an_error_that_names_them(tmp_path: Path) -> None:
     before = files_in(tmp_path)
     with pytest.raises(UserError) as error:
         prepare_output(tmp_path, settings=SETTINGS | {"views": 5})
-    assert str(error.value) == (
-        f"an earlier run had other settings (views was 3, is 5), {tmp_path / 'summary.json'}: "
-        "name another folder, or add --overwrite"
-    )
+    assert error.value.where == tmp_path / "summary.json"
+    assert "views was 3, is 5" in error.value.what and "--overwrite" in error.value.remedy
     assert files_in(tmp_path) == before
 
 
@@ -177,7 +252,7 @@ def test_a_folder_of_someone_else_is_refused(tmp_path: Path, name: str) -> None:
     before = files_in(tmp_path)
     with pytest.raises(UserError) as error:
         prepare_output(tmp_path, settings=SETTINGS)
-    assert f"something else ({name}), {tmp_path}: name" in str(error.value)
+    assert error.value.where == tmp_path and name in error.value.what
     assert files_in(tmp_path) == before
     assert not (tmp_path / "depth").exists()
 
@@ -225,15 +300,27 @@ def test_shards_share_a_folder_and_its_summary(tmp_path: Path) -> None:
     write_frame(first, "1")
     first.write_summary("complete")
     assert summary_of(tmp_path)["status"] == "running"
+    second.write_summary("stopped")
+    assert summary_of(tmp_path)["status"] == "stopped"
+    assert summary_of(tmp_path)["waiting_for"] == ["2/2"]
     write_frame(second, "2")
     second.write_summary("complete")
     summary = summary_of(tmp_path)
     assert summary["status"] == "complete" and set(summary["frames"]) == {"1", "2"}
+    assert "waiting_for" not in summary
     # A shard that starts again leaves the others' frames alone.
     again = prepare_output(
         tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=["2"], overwrite=True
     )
     assert (again.is_finished("1"), again.is_finished("2")) == (True, False)
+
+
+def test_a_shard_that_is_done_waits_for_those_that_never_ran(tmp_path: Path) -> None:
+    folder = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 4), frame_ids=["1"])
+    write_frame(folder, "1")
+    folder.write_summary("complete")
+    summary = summary_of(tmp_path)
+    assert (summary["status"], summary["waiting_for"]) == ("stopped", ["2/4", "3/4", "4/4"])
 
 
 def test_shards_that_start_and_finish_at_once_lose_nothing(tmp_path: Path) -> None:

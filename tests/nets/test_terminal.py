@@ -1,0 +1,53 @@
+"""Standard output that is no terminal: a pipe that somebody reads, or nobody any more."""
+
+import resource
+import subprocess
+import sys
+import time
+
+import pytest
+
+from deltas_nets import terminal
+
+
+def test_progress_is_a_line_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with terminal.progress("depth", 12) as report:
+        for _ in range(12):
+            now[0] += 4.0  # s
+            report("7")
+    assert capsys.readouterr().out.splitlines() == [f"depth: {n} of 12" for n in (3, 6, 9, 12)]
+
+
+def test_what_is_quick_tells_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with terminal.progress("depth", 3) as report:
+        report("7")
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("command", ["train", "depth"])
+def test_a_reader_that_has_seen_enough_is_no_error(command: str) -> None:
+    code = f"import sys; sys.argv = ['deltas', '{command}', '--help']; "
+    code += "from deltas_nets.cli import main; main()"
+    reading = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert reading.stdout is not None and reading.stderr is not None
+    reading.stdout.close()
+    assert reading.stderr.read() == b""
+    assert reading.wait() == terminal.READER_GONE
+    reading.stderr.close()
+
+
+def test_help_comes_at_once() -> None:
+    code = "import sys; from deltas_nets import cli; sys.argv = ['deltas', '--help']\n"
+    code += "try: cli.main()\n"
+    code += "finally: sys.exit(bool({'torch', 'numpy', 'PIL'} & set(sys.modules)))"
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    run = subprocess.run([sys.executable, "-c", code], check=False, stdout=subprocess.DEVNULL)
+    assert run.returncode == 0
+    # A fifth of a second here; torch alone takes two.
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 1
