@@ -146,7 +146,7 @@ class Frames(Mapping[str, Frame]):
         )
 
     def kept(self, mask: NDArray[np.bool_]) -> "Frames":
-        """Those of a mask ``(F,)``."""
+        """The frames where a mask ``(F,)`` is True."""
         arrays = self.arrays
         return Frames(
             self.folder,

@@ -23,7 +23,7 @@ class PosedImages(NamedTuple):
         return [self.images, *self.views, self.depth]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "PosedImages":
-        """Every tensor changed alike."""
+        """The same with every tensor changed by one function."""
         return PosedImages(
             change(self.images), PosedViews(*map(change, self.views)), change(self.depth)
         )

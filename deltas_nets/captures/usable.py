@@ -36,7 +36,7 @@ def usable_view_sets(
 
 
 def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[ViewSet, ...]:
-    """Those whose anchor has sensor depth."""
+    """The view sets whose anchor has sensor depth."""
     found = tuple(
         views for views in view_sets if capture.frame(views.anchor).depth_path is not None
     )

@@ -160,7 +160,7 @@ def _rate(
 
 
 def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> list[int]:
-    """Greedily the best, each discounted by how nearly it repeats one that was chosen.
+    """Choose the best one by one, each discounted by how nearly it repeats one that was chosen.
 
     A second view from the same place adds little; one from the opposite side sees what the
     first cannot, and its errors differ.

@@ -20,5 +20,5 @@ class Command:
         return cls
 
     def run(self) -> None:
-        """Do it; what is heavy is imported here."""
+        """Run the command; what is heavy is imported here."""
         raise NotImplementedError

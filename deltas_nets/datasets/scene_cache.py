@@ -49,7 +49,7 @@ def read_scene_cached(path: Path, cache: Path | None) -> Capture:
 
 
 def _state(path: Path) -> str:
-    """Changes with every file that a scene is read from."""
+    """A word that changes with every file that a scene is read from."""
     digest = hashlib.sha256(str(path.resolve()).encode())
     # An image is only named in the scene: its folder's time says whether names have changed.
     for folder in ("color", "depth"):
@@ -85,7 +85,7 @@ def _save(file: Path, scene: Capture) -> None:
 
 
 def _load(file: Path, path: Path) -> Capture | None:
-    """None where the file is damaged: it is written again."""
+    """What a file holds; None where it is damaged, and will be written again."""
     try:
         with safe_open(str(file), framework="np") as opened:
             metadata = opened.metadata()

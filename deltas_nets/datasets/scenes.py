@@ -33,7 +33,7 @@ class LeftOut:
         return LeftOut(**{name: getattr(self, name) + getattr(other, name) for name in names})
 
     def in_words(self) -> str:
-        """For a message.
+        """The counts for a message.
 
         Example:
             >>> LeftOut(lost=2, listed=1).in_words()

@@ -61,7 +61,7 @@ class ByGap(NamedTuple):
         return np.flatnonzero(complete)
 
     def sources(self, frames: Frames, anchor: int) -> list[int]:
-        """Nearest first, the earlier one of two."""
+        """Positions of the sources, nearest first, the earlier one of two."""
         numbers = frame_numbers(frames)
         wanted = numbers[anchor] + np.array(self.offsets())
         return [int(position) for position in np.searchsorted(numbers, wanted)]
@@ -98,7 +98,7 @@ class ByBaseline(NamedTuple):
         return np.flatnonzero(np.concatenate(enough)) if enough else np.zeros(0, dtype=np.intp)
 
     def sources(self, frames: Frames, anchor: int) -> list[int]:
-        """Best first."""
+        """Positions of the sources, best first."""
         qualify, cosines = self._qualify(frames, slice(anchor, anchor + 1))
         near = np.flatnonzero(qualify[0])
         centres = _centres(frames.cam_from_world)

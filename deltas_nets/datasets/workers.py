@@ -11,7 +11,7 @@ MOST_WORKERS = 8
 
 
 def leave_to_the_parent(worker: int) -> None:
-    """For such processes: they leave the group of the one that they work for.
+    """Leave the group of the process that this one works for.
 
     Ctrl-C in a terminal, ``timeout`` and job schedulers send their signal to a whole group. It
     must not end those processes before the one that they work for is done; then it ends them.

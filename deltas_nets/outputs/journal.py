@@ -51,7 +51,7 @@ class Journal:
 
 
 def read_journals(folder: Path) -> dict[str, Any]:
-    """By frame, what the killed runs of a folder had recorded; a line that was cut is no record."""
+    """What the killed runs of a folder had recorded, by frame; a line that was cut is no record."""
     records: dict[str, Any] = {}
     for file in _files(folder):
         try:

@@ -91,7 +91,7 @@ class Product(NamedTuple):
     needs_confidence: bool = False
 
     def file(self, folder: Path, id: str) -> Path:
-        """Where it is written."""
+        """Where it is written for a frame."""
         return folder / self.name / f"{id}{self.suffix}"
 
 

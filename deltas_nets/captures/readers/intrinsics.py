@@ -77,7 +77,10 @@ def _from_middle(K: FloatArray, image_size: tuple[int, int]) -> tuple[float, flo
 
 
 def _check_turned(K: FloatArray, image_size: tuple[int, int], path: Path) -> None:
-    """Turned by 90 degrees, as phones store portraits: the centre fits height and width swapped."""
+    """Refuse images that are turned by 90 degrees, as phones store portraits.
+
+    Their principal point fits height and width swapped.
+    """
     right, down = _from_middle(K, image_size)
     swapped = image_size[1], image_size[0]
     off_both_ways = right * down < 0 and min(abs(right), abs(down)) > CENTRAL
