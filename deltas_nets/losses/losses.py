@@ -16,6 +16,7 @@ from deltas_nets.losses.divisors import WHOLE, Divisors
 from deltas_nets.losses.seen import Seen
 from deltas_nets.losses.targets import detector_labels, keypoint_targets
 from deltas_nets.network.deltas import DepthPrediction
+from deltas_nets.network.origin import moved_to_anchor
 
 
 class Losses(NamedTuple):
@@ -61,6 +62,9 @@ def training_losses(
         divisors: how the number of places that a term is averaged over becomes that of the batch.
     """
     pixels = prediction.keypoints.pixels
+    views, origin = moved_to_anchor(views, views.cam_from_world.dtype)
+    points = prediction.points._replace(points=prediction.points.points - origin)
+    prediction = prediction._replace(points=points)
     seen = Seen(
         prediction,
         images[:, 0],

@@ -15,7 +15,8 @@ class Seen(NamedTuple):
     """What a term may look at.
 
     Attributes:
-        prediction: of the network, whose poses may have been noisy.
+        prediction: of the network, whose poses may have been noisy; its points, and those of the
+            targets, are in a world whose origin is where the anchor stands.
         image: ``(B, 3, H, W)`` the anchors as the network saw them.
         depth: ``(B, 1, H, W)`` of the anchors, metres, 0 = unknown.
         targets: truth about the keypoints.

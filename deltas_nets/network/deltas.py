@@ -18,10 +18,12 @@ from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
 from deltas_nets.config import NetworkConfig
 from deltas_nets.network.build import build_stages
 from deltas_nets.network.encoded import Encoded
+from deltas_nets.network.image_range import check_images
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.densifier import DenseDepth
 from deltas_nets.network.lite.detector import Keypoints
+from deltas_nets.network.origin import moved_to_anchor
 from deltas_nets.network.records import Posterior
 
 
@@ -47,7 +49,8 @@ class DepthPrediction(NamedTuple):
         std: ``(*B, 1, H, W)`` its standard deviation, metres, calibrated if the weights are.
         keypoints: N points of the anchor.
         matches: where they are seen in all views.
-        points: triangulated, in the world.
+        points: triangulated, in the world, in the dtype of the poses if that is wider than the
+            network's.
         sparse: their depth as an image.
         evidence: posterior, confidence, scales.
     """
@@ -119,7 +122,8 @@ class Deltas(nn.Module):
         Args:
             images: ``(*B, V, 3, H, W)`` RGB in [0, 1]; view 0 is the anchor, V >= 2. Of any
                 floating dtype, as are the cameras: both are cast to that of the weights.
-            views: their cameras, ``(*B, V)``.
+            views: their cameras, ``(*B, V)``, anywhere in the world: they are moved to
+                its origin before they are cast.
             depth_range: (near, far) of the search, metres.
             num_keypoints: instead of the config's.
             shift: ``(*B, 2)`` moves the spread keypoints, for variety in training.
@@ -129,15 +133,14 @@ class Deltas(nn.Module):
 
         Raises:
             ShapeError: a trailing shape differs, there is no source, or the batch is empty.
-            ValueError: the depth range makes no sense, or the refinement is not positive.
+            ValueError: the depth range makes no sense, the refinement is not positive, or, where
+                values can be looked at (on the CPU, untraced), the images are not in [0, 1].
             TypeError: the images are integers.
         """
         check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
         check_depth_range(depth_range)
         if refinement is not None and refinement < 1:
             raise ValueError(f"refinement must be at least 1, got {refinement}")
-        if not images.is_floating_point():
-            raise TypeError(f"images must be floating point in [0, 1], got {images.dtype}")
         if images.shape[-4] < 2:
             raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
         if 0 in images.shape:
@@ -162,7 +165,11 @@ class Deltas(nn.Module):
 
         Args:
             images: ``(B, V, 3, H, W)`` RGB in [0, 1].
+
+        Raises:
+            TypeError, ValueError: they are not, as for :meth:`forward`.
         """
+        check_images(images)
         features = self.encoder(images.to(self.dtype))
         return Encoded(features, self.descriptor(features))
 
@@ -189,7 +196,7 @@ class Deltas(nn.Module):
             refinement: as for :meth:`forward`.
         """
         features, descriptors = encoded
-        views = views.to(torch.promote_types(self.dtype, torch.float32))
+        views, origin = moved_to_anchor(views, torch.promote_types(self.dtype, torch.float32))
         keypoints = self.detector(
             features, image_size=image_size, num_keypoints=num_keypoints, shift=shift
         )
@@ -219,6 +226,7 @@ class Deltas(nn.Module):
             )
         dense = self.densifier(features, sparse)
 
+        in_world = torch.where(points.valid[..., None], points.points + origin, 0.0)
         full = dense.log_depth[0].exp()
         # A Laplace distribution deviates by sqrt(2) of its scale.
         log_std = upsample_to(dense.log_spread, image_size) + 0.5 * math.log(2)
@@ -227,7 +235,7 @@ class Deltas(nn.Module):
             std=self.calibration(log_std, views.K.shape[1]).exp() * full,
             keypoints=keypoints,
             matches=matches,
-            points=points,
+            points=points._replace(points=in_world),
             sparse=sparse,
             evidence=Evidence(confidence, posterior, dense),
         )
