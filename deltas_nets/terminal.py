@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import select
 import signal
 import sys
 import threading
@@ -58,9 +59,19 @@ def silent_without_reader() -> Iterator[None]:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
+        if not _reader_is_gone():  # but another process of ours
+            raise
         # What is left in the buffer is written when Python ends, and must not fail there.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(READER_GONE)
+
+
+def _reader_is_gone() -> bool:
+    if not hasattr(select, "poll"):  # on Windows
+        return True
+    waiting = select.poll()
+    waiting.register(sys.stdout.fileno(), 0)
+    return any(event & select.POLLERR for _, event in waiting.poll(0))
 
 
 @contextlib.contextmanager

@@ -78,7 +78,8 @@ def header_of_whole_file(path: Path) -> Header | None:
     """The header of a file that is surely whole; None where only decoding it can tell.
 
     A PNG is whole if the checksums of its chunks are right, a JPEG if it ends with the marker of
-    its end, which compressed data never holds. Either takes a tenth of the time of decoding, or less.
+    its end, which compressed data never holds. Either takes a tenth of the time of decoding, if
+    that.
     """
     try:
         with path.open("rb") as file, Image.open(file) as image:

@@ -304,7 +304,11 @@ def test_train_resume_and_refusal(run: Run, tmp_path: Path) -> None:
     weights = out / "weights.safetensors"
     late = ["--init", weights, "--start-step", 9, "--steps", 5]
     assert_one_line(run(*fresh, *late), "--start-step", "ends at 5")
-    assert_one_line(run("train", "--out", out, "--resume", "--steps", 9), "steps 2, not 9")
+    longer = run("train", "--out", out, "--resume", "--steps", 9)
+    assert_one_line(
+        longer, "steps 2, not 9", f"--init {out / 'weights.safetensors'} --start-step 2"
+    )
+    assert "start a new run" in run("train", "--out", out, "--resume", "--steps", 1).err
     assert_one_line(run("depth", "x", "--out", "y", "--weights", out / "checkpoint.pt"), "x")
     assert not (tmp_path / "x").exists()
 

@@ -42,6 +42,11 @@ def test_a_reader_that_has_seen_enough_is_no_error(command: str) -> None:
     reading.stderr.close()
 
 
+def test_another_broken_pipe_is_an_error_as_before(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(BrokenPipeError), terminal.silent_without_reader():
+        raise BrokenPipeError
+
+
 def test_help_comes_at_once() -> None:
     code = "import sys; from deltas_nets import cli; sys.argv = ['deltas', '--help']\n"
     code += "try: cli.main()\n"
