@@ -19,6 +19,7 @@ from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, depth_metrics, mean_metrics
 from deltas_nets.evaluate.points import point_depths, score_points
 from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import predict_frame
 
 
@@ -26,6 +27,7 @@ def main() -> None:
     capture = open_capture(sys.argv[1])
     view_sets = read_view_sets(Path(sys.argv[2]), capture)
     model, config = load_model(), PredictConfig()
+    encode = EncodedFrames(model)
     window = model.config.matcher.window
     print("means over frames: Abs Rel, delta < 1.25, coverage")
     for num_views in (3, 7):
@@ -33,7 +35,7 @@ def main() -> None:
         for views in view_sets:
             ids = (views.anchor, *views.sources[: num_views - 1])
             truth = depth_at_image(capture.frame(views.anchor))
-            result = predict_frame(model, [capture.frame(id) for id in ids], config)
+            result = predict_frame(encode, [capture.frame(id) for id in ids], config)
             _, true = point_depths(result.prediction, truth)
             posterior = result.prediction.evidence.posterior
             for number, logits in enumerate(posterior.stages):

@@ -84,11 +84,17 @@ def weights_record(name: str) -> dict[str, str]:
     """What identifies weights by name or file, and where they come from."""
     file = weights_file(name)
     metadata = read_metadata(file)
-    record = {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    record = {"name": name, "sha256": sha256_of(file)}
     for key in ("step", "seed", "data", "origin"):
         if key in metadata:
             record[key] = metadata[key]
     return record
+
+
+def sha256_of(file: Path) -> str:
+    """The fingerprint of a file's content."""
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def load_weights(model: torch.nn.Module, file: Path) -> None:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deltas_nets.commands.flags import Flag, Prediction
-from deltas_nets.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -24,11 +23,8 @@ class Demo(Prediction):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.network.deltas import Deltas
-        from deltas_nets.predict.demo import run_demo
+        from deltas_nets.evaluate.demo import run_demo
 
-        network = self.network()
-        if not isinstance(network, Deltas):
-            what = "the demo draws stages that the published network does not have"
-            raise UserError(what, self.weights, "use deltas depth")
-        run_demo(network, self.config(), self.out, self.weights, overwrite=self.overwrite)
+        what = "the demo draws stages that the reference network does not have"
+        model = self.predictor().deltas(what, self.weights, "use deltas depth")
+        run_demo(model, self.config(), self.out, self.weights, overwrite=self.overwrite)

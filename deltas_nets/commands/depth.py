@@ -73,8 +73,6 @@ class Depth(Prediction):
         from deltas_nets.outputs.products import MILLIMETRES, OutputOptions, check_depth_fits
         from deltas_nets.outputs.summary import SCALE, SUMMARY, read_summary, view_sets_in_json
         from deltas_nets.predict.capture import predict_capture
-        from deltas_nets.predict.ours import check_asked, states_confidence
-        from deltas_nets.predict.predictor import file_record, network_record
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
@@ -84,16 +82,16 @@ class Depth(Prediction):
         view_sets = usable_view_sets(capture, self.view_sets, self.views)
         check_all(capture, view_sets)
         warn_of(capture, view_sets, self.view_sets, self.depth_range)
-        network = self.network()
-        check_asked(network, config, capture, view_sets)
+        predictor = self.predictor()
+        predictor.check_asked(config, capture, view_sets)
         mine = view_sets[shard[0] - 1 :: shard[1]]
         scale = {} if self.depth_scale == MILLIMETRES else {SCALE: self.depth_scale}
         folder = prepare_output(
             self.out,
             settings={
                 "predict": to_dict(config),
-                "network": network_record(network),
-                "weights": file_record(self.weights, network),
+                "network": predictor.network_record(),
+                "weights": predictor.weights_record(self.weights),
                 "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
                 "precision": self.precision,
                 "views": self.views,
@@ -104,20 +102,20 @@ class Depth(Prediction):
             forbidden=capture.path,
             shard=shard,
             frame_ids=[views.anchor for views in mine],
-            options=replace(options, confidence=states_confidence(network)),
+            options=replace(options, confidence=predictor.states_confidence),
             head={
                 "versions": {"deltas-depth": __version__, "torch": torch.__version__},
                 "lost_poses": list(map(id_in_json, capture.lost)),
             },
         )
         with progress("depth", len(mine)) as report:
-            counts = predict_capture(network, capture, mine, folder, config, report=report)
-        kept = f", {counts.kept} kept from an earlier run" if counts.kept else ""
-        print(f"{counts.written} depth maps in {self.out}{kept}")
-        if not states_confidence(network):
-            print("no confidence is written: the published network states none")
-        if counts.blind:
-            warn(f"{counts.blind} maps without a triangulated point are guesses: see summary.json")
+            outcome = predict_capture(predictor, capture, mine, folder, config, report=report)
+        kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
+        print(f"{outcome.written} depth maps in {self.out}{kept}")
+        if not predictor.states_confidence:
+            print("no confidence is written: the reference network states none")
+        if outcome.blind:
+            warn(f"{outcome.blind} maps without a triangulated point are guesses: see summary.json")
         saturated = sum("saturated_pixels" in record for record in folder.frames.values())
         if saturated:
             most = f"{options.max_depth:g} m"

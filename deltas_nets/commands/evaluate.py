@@ -85,7 +85,6 @@ class Evaluate(Prediction):
         )
         from deltas_nets.evaluate.capture import evaluate_files, evaluate_network
         from deltas_nets.outputs.summary import recorded_view_sets
-        from deltas_nets.predict.ours import check_asked
 
         config = self.config()
         capture = open_capture(path).remembering()
@@ -100,14 +99,13 @@ class Evaluate(Prediction):
             return evaluate_files(
                 self.predictions, capture, view_sets, depth_range=self.depth_range
             )
-        network = self.network()
-        check_asked(network, config, capture, view_sets)
+        predictor = self.predictor()
+        predictor.check_asked(config, capture, view_sets)
         with progress("evaluate", len(view_sets)) as report:
-            return evaluate_network(network, capture, view_sets, config, report=report)
+            return evaluate_network(predictor, capture, view_sets, config, report=report)
 
     def _of_rooms(self, count: int) -> "CaptureScores":
         from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
-        from deltas_nets.network.deltas import Deltas
 
         config, views = self.config(), self.views or 3
         for given, name in ((self.view_sets, "--view-sets"), (self.predictions, "--predictions")):
@@ -117,10 +115,8 @@ class Evaluate(Prediction):
             raise UserError(f"no {count} rooms", "--rooms", f"give 1 to {len(EVALUATION_SEEDS)}")
         if not 2 <= views <= 12:
             raise UserError(f"no rooms of {views} views", "--views", "give 2 to 12")
-        network = self.network()
-        if not isinstance(network, Deltas):
-            what = "the published network has one camera, and rooms have others"
-            raise UserError(what, self.weights, "name a capture")
+        what = "the reference network has one camera, and rooms have others"
+        model = self.predictor().deltas(what, self.weights, "name a capture")
         rooms = held_out_rooms(
             count,
             EVALUATION_SEEDS,
@@ -129,4 +125,4 @@ class Evaluate(Prediction):
             conditions=self.conditions,
         )
         with progress("evaluate", count) as report:
-            return score_rooms(network, rooms, depth_range=self.depth_range, report=report)
+            return score_rooms(model, rooms, depth_range=self.depth_range, report=report)

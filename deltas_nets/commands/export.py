@@ -46,9 +46,8 @@ class Export(Command):
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.export import ExportConfig, export_onnx, export_program
-        from deltas_nets.network.deltas import Deltas
         from deltas_nets.outputs.atomic_files import check_writable
-        from deltas_nets.predict.predictor import load_network
+        from deltas_nets.predict.predictor import load_predictor
         from deltas_nets.weights_file import weights_record
 
         writers = {".onnx": export_onnx, ".pt2": export_program}
@@ -65,13 +64,12 @@ class Export(Command):
             refinement=self.refinement,
         )
         check_writable(self.out.parent)
-        network = load_network(self.weights)
-        if not isinstance(network, Deltas):
-            what = "the published network is not exported"
-            raise UserError(what, self.weights, "name weights of deltas train")
+        what = "the reference network is not exported"
+        remedy = "name weights of deltas train"
+        model = load_predictor(self.weights).deltas(what, self.weights, remedy)
         # Only the name: where files are is the machine's, and private.
         record = {**weights_record(self.weights), "name": Path(self.weights).name}
-        agreement = writers[self.out.suffix](network, self.out, config, weights=record)
+        agreement = writers[self.out.suffix](model, self.out, config, weights=record)
         megabytes = self.out.stat().st_size / 1e6
         print(
             f"{self.out} ({megabytes:.1f} MB) gives the network's depth "

@@ -11,7 +11,7 @@ from deltas_nets.errors import UserError
 
 if TYPE_CHECKING:
     from deltas_nets.predict.depth_map import PredictConfig
-    from deltas_nets.predict.predictor import AnyNetwork
+    from deltas_nets.predict.predictor import Predictor
 
 
 T = TypeVar("T")
@@ -40,18 +40,12 @@ class Prediction(Command):
     debug: Flag = False
     """Show the traceback of an error."""
 
-    def network(self) -> "AnyNetwork":
+    def predictor(self) -> "Predictor":
         """The network, where it is to run."""
-        from deltas_nets.network.deltas import Deltas
-        from deltas_nets.predict.predictor import load_network
+        from deltas_nets.predict.predictor import load_predictor
 
-        network = load_network(self.weights, usable_device(self.device))
-        if self.precision == "float32":
-            return network
-        if not isinstance(network, Deltas):
-            what = "the published network runs in float32 alone"
-            raise UserError(what, f"--precision {self.precision}", "leave it out")
-        return network.bfloat16()
+        device = usable_device(self.device)
+        return load_predictor(self.weights, device, precision=self.precision)
 
     def config(self, **more: Any) -> "PredictConfig":
         """The flags as a config, with nonsense refused."""

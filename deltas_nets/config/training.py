@@ -9,6 +9,7 @@ from deltas_nets.config.checks import check_at_least, check_positive, check_seed
 from deltas_nets.config.losses import LossConfig
 from deltas_nets.config.network import NetworkConfig
 from deltas_nets.config.scannet import ScanNetConfig
+from deltas_nets.config.schedule import Schedule
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class TrainConfig:
     """Peak of the schedule."""
     encoder_rate: float = 0.2
     """The encoder, which is pretrained, learns at this share of it."""
-    schedule: Literal["cosine", "constant"] = "cosine"
+    schedule: Schedule = "cosine"
     """After the warm-up: half a cosine down to a hundredth, or the peak to the end."""
     weight_decay: float = 1e-4
     """Of AdamW."""

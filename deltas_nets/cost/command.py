@@ -12,9 +12,7 @@ from deltas_nets.cost.literature import PAPER_SETTING
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
 from deltas_nets.errors import UserError
-from deltas_nets.network.lite.detector import CELL
 from deltas_nets.outputs.atomic_files import write_json
-from deltas_nets.reference import ReferenceNetwork
 from deltas_nets.terminal import warn
 
 MIN_SIDE = 32
@@ -33,7 +31,7 @@ def run_cost(
     """Print what each network costs, and beside the paper's figures if the setting is the paper's.
 
     Args:
-        models: by name, called as `Deltas` is, or the published network.
+        models: by name, called as `Deltas` is.
         num_views: the anchor and its sources.
         image_size: (height, width).
         num_keypoints: points to triangulate.
@@ -53,7 +51,7 @@ def run_cost(
     height, width = image_size
     fitting = {name: model for name, model in models.items() if _takes(model, image_size)}
     for name in models.keys() - fitting.keys():
-        left_out = f"{name} takes multiples of {CELL}, not {height} x {width}"
+        left_out = f"{name} takes multiples of {_multiple(models[name])}, not {height} x {width}"
         if not fitting:
             raise UserError(left_out, "command line", "change --size, or name other networks")
         warn(f"{left_out}: left out")
@@ -89,8 +87,13 @@ def run_cost(
 
 
 def _takes(model: nn.Module, image_size: tuple[int, int]) -> bool:
-    """The published network has no rule for cells that leave the image."""
-    return not (isinstance(model, ReferenceNetwork) and any(side % CELL for side in image_size))
+    """The reference network has no rule for cells that leave the image."""
+    return all(side % _multiple(model) == 0 for side in image_size)
+
+
+def _multiple(model: nn.Module) -> int:
+    """What the sides of images must be multiples of."""
+    return int(getattr(model, "side_multiple", 1))
 
 
 def device_name(model: nn.Module) -> str:

@@ -1,6 +1,5 @@
 """Cost of a network on posed images, by stage."""
 
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -11,11 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
-from deltas_geom.cameras.poses import relative_pose
 from deltas_nets.cost.memory import PeakMemory
 from deltas_nets.cost.operations import Flops, OperationCounter
-from deltas_nets.cost.stages import GEOMETRY, followed_stages, parameters_by_stage, stage_names
-from deltas_nets.reference import ReferenceNetwork
+from deltas_nets.cost.stages import (
+    followed_stages,
+    parameters_by_stage,
+    stage_names,
+    timed_stages,
+)
 
 
 class StageCost(NamedTuple):
@@ -59,7 +61,7 @@ def cost_of(
     """Cost of one anchor's depth, without gradients, where the model is.
 
     Args:
-        model: called as `Deltas` is, or the published network; its children are its stages.
+        model: called as `Deltas` is; its children are its stages.
         num_views: the anchor and its sources.
         image_size: (height, width).
         num_keypoints: points to triangulate.
@@ -68,7 +70,11 @@ def cost_of(
     images, views = posed_noise(num_views, image_size=image_size)
     weight = next(model.parameters())
     images, views = images.to(weight), PosedViews(*(tensor.to(weight) for tensor in views))
-    return cost_of_run(model, _pass_of(model, images, views, num_keypoints), repeats=repeats)
+
+    def run() -> object:
+        return model(images, views, num_keypoints=num_keypoints)
+
+    return cost_of_run(model, run, repeats=repeats)
 
 
 def cost_of_run(model: nn.Module, run: Callable[[], object], *, repeats: int = 5) -> Cost:
@@ -128,24 +134,6 @@ def posed_noise(num_views: int, *, image_size: tuple[int, int]) -> tuple[Tensor,
     return images, PosedViews(K.repeat(num_views, 1, 1), cam_from_world)
 
 
-def _pass_of(
-    model: nn.Module, images: Tensor, views: PosedViews, num_keypoints: int
-) -> Callable[[], object]:
-    """What is measured: from images to depth, as each network is called."""
-    if not isinstance(model, ReferenceNetwork):
-        return lambda: model(images, views, num_keypoints=num_keypoints)
-    anchor, sources = views.cam_from_world[:1], views.cam_from_world[1:]
-    cam_from_anchor = relative_pose(sources, anchor)[None]
-
-    def run() -> object:
-        generator = torch.Generator().manual_seed(0)  # random keypoints, the same in each run
-        return model.predict(
-            images, views.K[:1], cam_from_anchor, num_points=num_keypoints, generator=generator
-        )
-
-    return run
-
-
 def _counted(model: nn.Module, run: Callable[[], object]) -> OperationCounter:
     counter = OperationCounter()
     with followed_stages(model, counter.enter), counter:
@@ -156,21 +144,10 @@ def _counted(model: nn.Module, run: Callable[[], object]) -> OperationCounter:
 def _timed(model: nn.Module, run: Callable[[], object]) -> Mapping[str, float]:
     """Seconds of each stage in one run."""
     seconds: dict[str, float] = defaultdict(float)
-    device = next(model.parameters()).device
-    active, since = GEOMETRY, time.perf_counter()
-
-    def enter(stage: str) -> None:
-        nonlocal active, since
-        if device.type != "cpu":
-            # Kernels run on after the call that started them returns.
-            torch.accelerator.synchronize(device)
-        now = time.perf_counter()
-        seconds[active] += now - since
-        active, since = stage, now
-
-    with followed_stages(model, enter):
+    with timed_stages(model) as laps:
         run()
-        enter(GEOMETRY)
+    for stage, lap in laps:
+        seconds[stage] += lap
     return seconds
 
 

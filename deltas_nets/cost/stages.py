@@ -1,9 +1,11 @@
 """Which stage of a network is at work: its direct children, and what lies between them."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from torch import nn
 
 GEOMETRY = "geometry"
@@ -46,6 +48,47 @@ def followed_stages(model: nn.Module, enter: Callable[[str], None]) -> Iterator[
     finally:
         for handle in handles:
             handle.remove()
+
+
+class Lap(NamedTuple):
+    """A stretch of time in which one stage was at work.
+
+    Attributes:
+        stage: its name, or `GEOMETRY`.
+        seconds: how long.
+    """
+
+    stage: str
+    seconds: float
+
+
+@contextmanager
+def timed_stages(model: nn.Module) -> Iterator[list[Lap]]:
+    """Measure what the model does inside the block.
+
+    Args:
+        model: as for :func:`followed_stages`.
+
+    Yields:
+        The laps, whose last one ends with the block; the first and the last are of `GEOMETRY`.
+    """
+    laps: list[Lap] = []
+    device = next(model.parameters()).device
+    active, since = GEOMETRY, time.perf_counter()
+
+    def enter(stage: str) -> None:
+        nonlocal active, since
+        if device.type != "cpu":
+            # Kernels run on after the call that started them returns.
+            torch.accelerator.synchronize(device)
+        now = time.perf_counter()
+        if stage != active:
+            laps.append(Lap(active, now - since))
+            active, since = stage, now
+
+    with followed_stages(model, enter):
+        yield laps
+        enter("")
 
 
 def stage_names(model: nn.Module) -> list[str]:

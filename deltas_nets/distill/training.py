@@ -8,7 +8,6 @@ head on top, in seconds per thousand steps. The paper distils from SuperPoint in
 """
 
 import json
-import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -20,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_nets.config.distill import DistillConfig
+from deltas_nets.config.schedule import rate_factor
 from deltas_nets.distill.labels import hard_labels, soft_labels
 from deltas_nets.distill.lessons import Lessons, prepare
 from deltas_nets.distill.pictures import FIRST_ROOM, IMAGE_SIZE, NUM_ROOMS
@@ -158,7 +158,7 @@ def train_detector(
     first = torch.full((), torch.inf)
     for step, chosen in enumerate(order):
         for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * _rate_factor(step, config.steps)
+            group["lr"] = config.learning_rate * rate_factor(step, config.steps, warmup=100)
         batch = Lessons(*(part[chosen].float() for part in lessons))
         features = _features(encoder, batch)
         logits = model.detector(features, image_size=IMAGE_SIZE, num_keypoints=8).logits
@@ -193,11 +193,6 @@ def _targets(scores: Tensor, config: DistillConfig) -> Tensor:
     if config.labels == "hard":
         return hard_labels(scores, threshold=config.threshold)
     return soft_labels(scores, gain=config.gain)
-
-
-def _rate_factor(step: int, steps: int) -> float:
-    warm = min(1.0, (step + 1) / max(1, min(100, steps // 10)))
-    return warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
 
 def record_of(config: DistillConfig, before: dict[str, str], loss: Tensor) -> dict[str, str]:

@@ -2,13 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import torch.nn.functional as F
-from numpy.typing import NDArray
 
-from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.errors import UserError
@@ -17,31 +14,14 @@ from deltas_nets.evaluate.points import score_keypoints
 from deltas_nets.evaluate.scores import CaptureScores as CaptureScores
 from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
 from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
-from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.products import read_depth_png
 from deltas_nets.outputs.summary import recorded_depth_scale
-from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, keypoint_depths
-from deltas_nets.predict.encoded_frames import EncodedFrames
-from deltas_nets.predict.ours import predict_frame, predict_map, remembering
-from deltas_nets.reference import ReferenceNetwork
-
-
-class _Map(NamedTuple):
-    """A depth map, the points it rests on, and its uncertainty if the network states one.
-
-    Attributes:
-        depth: ``(H, W)`` metres.
-        relative_std: ``(H, W)`` standard deviation as a share of the depth.
-        keypoints: with their depth.
-    """
-
-    depth: NDArray[np.float32]
-    relative_std: NDArray[np.float32] | None
-    keypoints: KeypointDepths
+from deltas_nets.predict.depth_map import PredictConfig, resized
+from deltas_nets.predict.predictor import Predictor
 
 
 def evaluate_network(
-    network: Deltas | ReferenceNetwork,
+    predictor: Predictor,
     capture: Capture,
     view_sets: Sequence[ViewSet],
     config: PredictConfig,
@@ -51,7 +31,7 @@ def evaluate_network(
     """Predict every view set and score it.
 
     Args:
-        network: trained.
+        predictor: of a trained network.
         capture: frames with sensor depth.
         view_sets: anchors and sources.
         config: as for prediction.
@@ -62,35 +42,20 @@ def evaluate_network(
     """
     scores: dict[str, MapScores | None] = {}
     meter = CalibrationMeter()
-    seer = remembering(network)
     for views in view_sets:
         anchor = capture.frame(views.anchor)
         truth = depth_at_image(anchor)
         frames = [anchor, *(capture.frame(id) for id in views.sources)]
-        found = _predict(seer, frames, config)
+        found = predictor.depth_map(frames, config)
         sparse = score_keypoints(found.keypoints, truth, config.depth_range)
         scores[str(views.anchor)] = score_map(found.depth, truth, config.depth_range, sparse)
-        if found.relative_std is not None:
-            true = resize_nearest(truth, (found.depth.shape[0], found.depth.shape[1]))
-            meter.add(found.depth, found.relative_std, true, depth_range=config.depth_range)
+        if found.log_std is not None:
+            size = (found.depth.shape[0], found.depth.shape[1])
+            relative_std = np.exp(resized(found.log_std, size))
+            true = resize_nearest(truth, size)
+            meter.add(found.depth, relative_std, true, depth_range=config.depth_range)
         report(str(views.anchor))
     return _mean(scores, capture.path, meter)
-
-
-def _predict(
-    network: EncodedFrames | ReferenceNetwork, frames: Sequence[Frame], config: PredictConfig
-) -> _Map:
-    if isinstance(network, ReferenceNetwork):
-        stated = predict_map(network, frames, config)
-        return _Map(stated.depth, None, stated.keypoints)
-    result = predict_frame(network, frames, config)
-    prediction = result.prediction
-    # In logs, as the network forms it: the order of neighbours stays.
-    log_std = (prediction.std / prediction.depth).log()
-    size = (result.depth.shape[0], result.depth.shape[1])
-    resized = F.interpolate(log_std[None], size=size, mode="bilinear", align_corners=False)
-    relative_std = resized[0, 0].exp().float().cpu().numpy()
-    return _Map(result.depth, relative_std, keypoint_depths(prediction))
 
 
 def evaluate_files(

@@ -60,10 +60,13 @@ class DepthMap(NamedTuple):
 
     Attributes:
         depth: ``(H, W)`` float32 metres; 0 where there is none.
-        confidence: ``(H, W)`` float32 as in `FrameDepth`; None where the network states none.
+        confidence: ``(H, W)`` float32, probability that the relative error is below 5 %; None where
+            the network states none.
         points: ``(N, 3)`` float64 in the capture's world, metres.
         colors: ``(N, 3)`` uint8.
         keypoints: the points that the map rests on.
+        log_std: ``(1, h, w)`` log of the standard deviation as a share of the depth, at the size
+            that the network works at; None where the network states none.
     """
 
     depth: NDArray[np.float32]
@@ -71,6 +74,7 @@ class DepthMap(NamedTuple):
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     keypoints: KeypointDepths
+    log_std: torch.Tensor | None = None
 
 
 def keypoint_depths(prediction: DepthPrediction) -> KeypointDepths:

@@ -1,7 +1,8 @@
-"""From posed frames to a depth map."""
+"""From posed frames to a depth map, by a network of deltas."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,20 +12,17 @@ from deltas_geom import PosedViews
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import anchor_views, fit_work_size
-from deltas_nets.errors import UserError
+from deltas_nets.config import to_dict
 from deltas_nets.network.deltas import Deltas, DepthPrediction, with_batch_dims
-from deltas_nets.predict import reference as published
 from deltas_nets.predict.depth_map import (
     DepthMap,
-    KeypointDepths,
     PredictConfig,
-    frames_of,
     keypoint_depths,
     point_cloud,
     resized,
 )
 from deltas_nets.predict.encoded_frames import EncodedFrames
-from deltas_nets.reference import ReferenceNetwork
+from deltas_nets.weights_file import weights_record
 
 WORK_PIXELS = 120_000
 """Pixels of the image that the network sees, unless a size is given; see decision 5."""
@@ -52,102 +50,66 @@ class FrameDepth(NamedTuple):
     views: PosedViews
 
 
-def check_asked(
-    network: Deltas | ReferenceNetwork,
-    config: PredictConfig,
-    capture: Capture,
-    view_sets: Sequence[ViewSet],
-) -> None:
-    """Whether a network can do what it is asked for; networks of deltas can do all of it.
+class DeltasPredictor:
+    """A network of deltas for many view sets of one capture: it encodes every frame once.
+
+    See :class:`deltas_nets.predict.predictor.Predictor`.
 
     Args:
-        network: that is to predict.
-        config: sizes, range, confidence.
-        capture: the frames.
-        view_sets: anchors and sources.
-
-    Raises:
-        UserError: the published network, which has one depth range and one camera and states no
-            confidence, is asked for others.
+        model: trained, on any device; its weights must not change meanwhile.
     """
-    if not isinstance(network, ReferenceNetwork):
-        return
-    if config.depth_range != published.DEPTH_RANGE:
-        near, far = published.DEPTH_RANGE
-        raise UserError(
-            f"the published network searches {near:g} to {far:g} m", "--depth-range", "leave it out"
+
+    states_confidence = True
+
+    def __init__(self, model: Deltas) -> None:
+        self.encode = EncodedFrames(model)
+
+    def check_asked(
+        self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
+    ) -> None:
+        """It can do all of it."""
+
+    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+        """Depth of the first frame from all of them."""
+        found = predict_frame(self.encode, frames, config)
+        prediction = found.prediction
+        return DepthMap(
+            found.depth,
+            found.confidence,
+            found.points,
+            found.colors,
+            keypoint_depths(prediction),
+            # In logs, as the network forms it: the order of neighbours stays.
+            (prediction.std / prediction.depth).log(),
         )
-    if config.min_confidence > 0:
-        raise UserError(
-            "the published network states no confidence", "--min-confidence", "leave it out"
-        )
-    work_size = config.work_size or published.WORK_SIZE
-    published.check_work_size(work_size)
-    for views in view_sets:
-        published.check_cameras(frames_of(capture, views), work_size=work_size)
 
+    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
+        """The network itself."""
+        return self.encode.model
 
-def states_confidence(network: Deltas | ReferenceNetwork) -> bool:
-    """Whether maps of a network come with a confidence."""
-    return not isinstance(network, ReferenceNetwork)
+    def network_record(self) -> dict[str, Any]:
+        """Its config."""
+        return to_dict(self.encode.model.config)
 
-
-def predict_map(
-    network: EncodedFrames | ReferenceNetwork, frames: Sequence[Frame], config: PredictConfig
-) -> DepthMap:
-    """Depth of the first frame from all of them, by a network of either kind.
-
-    Args:
-        network: on any device, from :func:`remembering`; asked for what it can do
-            (:func:`check_asked`).
-        frames: the anchor and its sources.
-        config: sizes, range, confidence.
-
-    Raises:
-        UserError: an image cannot be read.
-    """
-    if isinstance(network, ReferenceNetwork):
-        return _published_map(network, frames, config)
-    result = predict_frame(network, frames, config)
-    keypoints = keypoint_depths(result.prediction)
-    return DepthMap(result.depth, result.confidence, result.points, result.colors, keypoints)
-
-
-def _published_map(
-    network: ReferenceNetwork, frames: Sequence[Frame], config: PredictConfig
-) -> DepthMap:
-    work_size = config.work_size or published.WORK_SIZE
-    found = published.predict_published(network, frames, work_size=work_size)
-    size = config.size or frames[0].image_size
-    depth = np.maximum(resized(found.depth, size), 0)  # below 0 it is no depth
-    points, colors = point_cloud(frames[0], depth, size, work_size)
-    keypoints = KeypointDepths(found.pixels, found.point_depth, work_size)
-    return DepthMap(depth, None, points, colors, keypoints)
-
-
-def remembering(network: Deltas | ReferenceNetwork) -> EncodedFrames | ReferenceNetwork:
-    """The network for many view sets of one capture: it encodes every frame once.
-
-    The published network looks at all images of a view set together, so it remembers none.
-    """
-    return EncodedFrames(network) if isinstance(network, Deltas) else network
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """What the weights file says of itself."""
+        return weights_record(name_or_file)
 
 
 @torch.inference_mode()
 def predict_frame(
-    model: Deltas | EncodedFrames, frames: Sequence[Frame], config: PredictConfig
+    encode: EncodedFrames, frames: Sequence[Frame], config: PredictConfig
 ) -> FrameDepth:
     """Depth of the first frame from all of them.
 
     Args:
-        model: a trained network, on any device; or one that remembers the frames it has seen.
+        encode: of a trained network, on any device.
         frames: the anchor and its sources.
         config: sizes, range, confidence.
 
     Raises:
         UserError: an image cannot be read.
     """
-    encode = model if isinstance(model, EncodedFrames) else EncodedFrames(model)
     device = next(encode.model.parameters()).device
     anchor = frames[0]
     work_size = config.work_size or fit_work_size(anchor.image_size, max_pixels=WORK_PIXELS)

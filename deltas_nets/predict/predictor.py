@@ -1,64 +1,106 @@
-"""Which network a weights file holds: one of deltas, or the published one."""
+"""What every network that predicts can be asked, and which one a weights file holds."""
 
-import hashlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Protocol
 
 import torch
 
 from deltas_nets import reference
-from deltas_nets.config import to_dict
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.reference import ReferenceNetwork
-from deltas_nets.weights_file import load_model, weights_file, weights_record
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig
+from deltas_nets.predict.ours import DeltasPredictor
+from deltas_nets.predict.reference import ReferencePredictor
+from deltas_nets.weights_file import load_model, weights_file
 
-AnyNetwork = Deltas | ReferenceNetwork
+Precision = Literal["float32", "bfloat16"]
 
 
-def load_network(name_or_file: str | Path, device: str | torch.device = "cpu") -> AnyNetwork:
+class Predictor(Protocol):
+    """A network of deltas, or the reference network, as commands see it."""
+
+    @property
+    def states_confidence(self) -> bool:
+        """Whether maps come with a confidence."""
+
+    def check_asked(
+        self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
+    ) -> None:
+        """Whether the network can do what it is asked for.
+
+        Args:
+            config: sizes, range, confidence.
+            capture: the frames.
+            view_sets: anchors and sources.
+
+        Raises:
+            UserError: names what it cannot.
+        """
+
+    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+        """Depth of the first frame from all of them; frames seen before need not be encoded again.
+
+        Args:
+            frames: the anchor and its sources.
+            config: sizes, range, confidence; asked for what it can do (:meth:`check_asked`).
+
+        Raises:
+            UserError: an image cannot be read.
+        """
+
+    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
+        """The network itself, for what needs all stages of one of deltas.
+
+        Raises:
+            UserError: of the arguments, if it is another network.
+        """
+
+    def network_record(self) -> dict[str, Any]:
+        """What the network is, for the record of a run."""
+
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """What identifies the file that it was loaded from, and where that comes from."""
+
+
+def load_predictor(
+    name_or_file: str | Path,
+    device: str | torch.device = "cpu",
+    *,
+    precision: Precision = "float32",
+) -> Predictor:
     """The network of a shipped name, of a file of `deltas train`, or of the published checkpoint.
 
     Args:
         name_or_file: what the file holds is read from it, not from its name.
         device: where to put it.
+        precision: of the weights; geometry stays in float32.
 
     Raises:
-        UserError: no such file, or it holds none of these, or not all of its weights.
+        UserError: no such file, or it holds none of these, or not all of its weights, or the
+            network does not run in this precision.
 
     Example:
-        >>> load_network("deltas-small").config.name
+        >>> load_predictor("deltas-small").network_record()["name"]
         'deltas-small'
     """
     file = weights_file(name_or_file)
     if reference.is_published(file):
-        return reference.load(file, device=device)
+        if precision != "float32":
+            what = "the reference network runs in float32 alone"
+            raise UserError(what, f"--precision {precision}", "leave it out")
+        return ReferencePredictor(reference.load(file, device=device))
     if not _is_safetensors(file):
         raise UserError(
             "neither weights of deltas train nor the published checkpoint",
             file,
             "name a weights.safetensors, or the file that the authors of the paper published",
         )
-    return load_model(name_or_file, device)
-
-
-def network_record(network: AnyNetwork) -> dict[str, Any]:
-    """What a network is, for the record of a run."""
-    if isinstance(network, ReferenceNetwork):
-        return {"name": "published"}
-    return to_dict(network.config)
-
-
-def file_record(name_or_file: str, network: AnyNetwork) -> dict[str, str]:
-    """What identifies the file that a network was loaded from, and where it comes from."""
-    if isinstance(network, Deltas):
-        return weights_record(name_or_file)
-    content = weights_file(name_or_file).read_bytes()
-    return {
-        "name": name_or_file,
-        "sha256": hashlib.sha256(content).hexdigest(),
-        "origin": "the published checkpoint",
-    }
+    model = load_model(name_or_file, device)
+    return DeltasPredictor(model.bfloat16() if precision == "bfloat16" else model)
 
 
 def _is_safetensors(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Depth of frames by the published network, prepared as its authors' test program did.
+"""Depth of frames by the reference network, prepared as its authors' test program did.
 
 Images are resized linearly to 240 x 320, each axis by itself and without antialiasing, as the
 published weights saw them; one camera matrix stands for all views. The network searches 0.5 to
@@ -6,7 +6,8 @@ published weights saw them; one camera matrix stands for all views. The network 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,12 +16,23 @@ from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_geom.cameras.poses import relative_pose
-from deltas_nets.captures.capture import Frame
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import SMALLEST_BASELINE
 from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.detector import CELL
+from deltas_nets.predict.depth_map import (
+    DepthMap,
+    KeypointDepths,
+    PredictConfig,
+    frames_of,
+    point_cloud,
+    resized,
+)
 from deltas_nets.reference import ReferenceNetwork, evaluation_input
 from deltas_nets.reference.segments import FAR, NEAR
+from deltas_nets.weights_file import sha256_of, weights_file
 
 DEPTH_RANGE = (NEAR, FAR)
 """What is searched, metres: the network has no other."""
@@ -32,7 +44,7 @@ SEED = 1
 """Of the points that are drawn at random, the same for every frame."""
 
 
-class PublishedInput(NamedTuple):
+class ReferenceInput(NamedTuple):
     """One anchor and V sources as the network wants them.
 
     Attributes:
@@ -46,7 +58,7 @@ class PublishedInput(NamedTuple):
     cam_from_anchor: Tensor
 
 
-class PublishedDepth(NamedTuple):
+class ReferenceDepth(NamedTuple):
     """What the network says of an anchor; it says nothing of how sure it is.
 
     Attributes:
@@ -61,6 +73,62 @@ class PublishedDepth(NamedTuple):
     point_depth: Tensor
 
 
+class ReferencePredictor:
+    """The reference network; it looks at all images of a view set together and remembers none.
+
+    See :class:`deltas_nets.predict.predictor.Predictor`.
+
+    Args:
+        network: from :func:`deltas_nets.reference.load`, on any device.
+    """
+
+    states_confidence = False
+
+    def __init__(self, network: ReferenceNetwork) -> None:
+        self.network = network
+
+    def check_asked(
+        self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
+    ) -> None:
+        """It has one depth range and one camera, takes multiples of 8 and states no confidence."""
+        if config.depth_range != DEPTH_RANGE:
+            what = "the reference network searches {:g} to {:g} m".format(*DEPTH_RANGE)
+            raise UserError(what, "--depth-range", "leave it out")
+        if config.min_confidence > 0:
+            what = "the reference network states no confidence"
+            raise UserError(what, "--min-confidence", "leave it out")
+        work_size = config.work_size or WORK_SIZE
+        check_work_size(work_size)
+        for views in view_sets:
+            check_cameras(frames_of(capture, views), work_size=work_size)
+
+    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+        """Depth of the first frame from all of them."""
+        work_size = config.work_size or WORK_SIZE
+        found = predict_reference(self.network, frames, work_size=work_size)
+        size = config.size or frames[0].image_size
+        depth = np.maximum(resized(found.depth, size), 0)  # below 0 it is no depth
+        points, colors = point_cloud(frames[0], depth, size, work_size)
+        keypoints = KeypointDepths(found.pixels, found.point_depth, work_size)
+        return DepthMap(depth, None, points, colors, keypoints)
+
+    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
+        """It is none."""
+        raise UserError(refusal, where, remedy)
+
+    def network_record(self) -> dict[str, Any]:
+        """Its name in records."""
+        return {"name": "published"}
+
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """The file's fingerprint."""
+        return {
+            "name": name_or_file,
+            "sha256": sha256_of(weights_file(name_or_file)),
+            "origin": "the published checkpoint",
+        }
+
+
 def check_cameras(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> None:
     """Whether one camera matrix can stand for all frames.
 
@@ -71,16 +139,16 @@ def check_cameras(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> Non
     for frame in frames[1:]:
         if not torch.allclose(_intrinsics(frame, work_size), anchor, rtol=0, atol=SAME_CAMERA):
             raise UserError(
-                f"the published network knows one camera, frame {frame.id} has another than "
+                f"the reference network knows one camera, frame {frame.id} has another than "
                 f"frame {frames[0].id}",
                 frame.image_path,
                 "leave the frame out of the view sets, or use other weights",
             )
 
 
-def predict_published(
+def predict_reference(
     network: ReferenceNetwork, frames: Sequence[Frame], *, work_size: tuple[int, int] = WORK_SIZE
-) -> PublishedDepth:
+) -> ReferenceDepth:
     """Depth of the first frame from all of them.
 
     Args:
@@ -93,18 +161,18 @@ def predict_published(
         ShapeError: a side is no multiple of 8.
     """
     device = next(network.parameters()).device
-    given = PublishedInput(*(part.to(device) for part in load_input(frames, work_size)))
+    given = ReferenceInput(*(part.to(device) for part in load_input(frames, work_size)))
     generator = torch.Generator().manual_seed(SEED)
     prediction = network.predict(*given, generator=generator)
     matched = prediction.matched
     z = matched.points_3d[0, :, 2]
     used = (matched.in_range != 0).any(dim=1)[0] & (z > NEAR) & (z < FAR)
-    return PublishedDepth(
+    return ReferenceDepth(
         prediction.depth[0], prediction.keypoints[0], torch.where(used, z, torch.zeros_like(z))
     )
 
 
-def load_input(frames: Sequence[Frame], work_size: tuple[int, int] = WORK_SIZE) -> PublishedInput:
+def load_input(frames: Sequence[Frame], work_size: tuple[int, int] = WORK_SIZE) -> ReferenceInput:
     """Images, the anchor's camera and the relative poses of an anchor and its sources.
 
     Raises:
@@ -117,7 +185,7 @@ def load_input(frames: Sequence[Frame], work_size: tuple[int, int] = WORK_SIZE) 
     apart = poses[:, :3, 3].norm(dim=-1) > SMALLEST_BASELINE
     poses[:, :3, 3] *= apart[:, None]  # the rest is rounding, and would pass for parallax
     K = _intrinsics(frames[0], work_size)
-    return PublishedInput(evaluation_input(images), K[None].float(), poses[None].float())
+    return ReferenceInput(evaluation_input(images), K[None].float(), poses[None].float())
 
 
 def check_work_size(work_size: tuple[int, int]) -> None:
@@ -128,7 +196,7 @@ def check_work_size(work_size: tuple[int, int]) -> None:
     """
     if work_size[0] % CELL or work_size[1] % CELL:
         raise UserError(
-            f"the published network takes multiples of {CELL}",
+            f"the reference network takes multiples of {CELL}",
             "--work-size {} {}".format(*work_size),
             "leave it out to use {} {}".format(*WORK_SIZE),
         )

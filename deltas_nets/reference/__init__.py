@@ -1,6 +1,6 @@
-"""The originally published network, run exactly as it was: its checkpoint and its quirks.
+"""The network that the paper's authors published, run exactly as it was, with its quirks.
 
-The layers are those of `deltas_nets.network`; what this package adds is how the published
+The layers are those of `deltas_nets.network`; what this package adds is how their
 program chose segments, read descriptors, weighted views and drew the sparse depth. What differs
 from the paper and from the rest of deltas is listed in `docs/differences.md`.
 

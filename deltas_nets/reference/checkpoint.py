@@ -1,4 +1,4 @@
-"""The file of the published network: three tables of weights, read without running any code."""
+"""The file of the reference network: three tables of weights, read without running any code."""
 
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ _REMEDY = "name the checkpoint that the authors of the paper published"
 
 
 def is_published(file: str | Path) -> bool:
-    """Whether a file is a checkpoint in the layout of the published network.
+    """Whether a file is a checkpoint in the layout of the reference network.
 
     Only the three tables' names are looked at; :func:`load` checks what is in them.
     """
@@ -36,7 +36,7 @@ def is_published(file: str | Path) -> bool:
 
 
 def load(*source: str | Path | Table, device: str | torch.device = "cpu") -> ReferenceNetwork:
-    """The published network with the weights of a checkpoint.
+    """The reference network with the weights of a checkpoint.
 
     Args:
         source: a file; or a mapping with the entries ``state_dict``, ``state_dict_tri`` and

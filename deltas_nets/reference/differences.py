@@ -1,4 +1,4 @@
-"""Paper, published network and deltas: what each does where they disagree.
+"""Paper, reference network and deltas: what each does where they disagree.
 
 ``python -m deltas_nets.reference.differences`` prints the page `docs/differences.md`.
 """
@@ -13,14 +13,14 @@ class Difference(NamedTuple):
         number: of the row.
         topic: what it is about.
         paper: what the paper says.
-        published: what the published network or its test program does.
-        deltas: what deltas does unless told to run the published network.
+        reference: what the authors' network or its test program does.
+        deltas: what deltas does unless told to run the reference network.
     """
 
     number: int
     topic: str
     paper: str
-    published: str
+    reference: str
     deltas: str
 
 
@@ -181,14 +181,14 @@ DIFFERENCES = (
         "Supervised scales",
         "four scales from full resolution to 1/16",
         "has four outputs at 1, 1/2, 1/4 and 1/8",
-        "the paper's decoder has the published four; `deltas-small` has 1, 1/4, 1/8 and 1/16",
+        "the paper's decoder has the reference's four; `deltas-small` has 1, 1/4, 1/8 and 1/16",
     ),
     Difference(
         22,
         "Spatial pyramid",
         "spatial pyramid pooling, ASPP",
         "densely connected dilated convolutions at 1/8, without pooling",
-        "the paper's decoder does as published; `deltas-small` has none",
+        "the paper's decoder does as the reference; `deltas-small` has none",
     ),
     Difference(
         23,
@@ -232,14 +232,14 @@ _HEAD = """\
 # Differences from the original
 
 Where the paper and the network that its authors published disagree, or leave something open, this
-is what each does, and what deltas does. The published network as it is, with all of this, is
+is what each does, and what deltas does. The reference network as it is, with all of this, is
 `deltas_nets.reference`, which `deltas depth --weights FILE` runs where FILE is the
 [published checkpoint](published_checkpoint.md); only there do its rules apply.
 
 This page is generated: change `deltas_nets/reference/differences.py`, then run
 `python -m deltas_nets.reference.differences > docs/differences.md`.
 
-| | | The paper | The published network | deltas |
+| | | The paper | The reference network | deltas |
 |--|--|--|--|--|
 """
 
@@ -247,7 +247,7 @@ This page is generated: change `deltas_nets/reference/differences.py`, then run
 def page() -> str:
     """The page as Markdown."""
     rows = (
-        f"| {row.number} | {row.topic} | {row.paper} | {row.published} | {row.deltas} |\n"
+        f"| {row.number} | {row.topic} | {row.paper} | {row.reference} | {row.deltas} |\n"
         for row in DIFFERENCES
     )
     return _HEAD + "".join(rows)

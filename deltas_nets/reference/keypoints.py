@@ -1,4 +1,4 @@
-"""Key points of the published network: suppressed in two passes, topped up at random."""
+"""Key points of the reference network: suppressed in two passes, topped up at random."""
 
 from typing import NamedTuple
 

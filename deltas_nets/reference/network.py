@@ -1,4 +1,4 @@
-"""The published network: the layers of `deltas_nets.network` under the published rules."""
+"""The reference network: the layers of `deltas_nets.network` under its own rules."""
 
 from collections.abc import Sequence
 
@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from deltas_geom import PosedViews
+from deltas_geom.cameras.poses import relative_pose
 from deltas_geom.checks import ShapeError
 from deltas_nets.network.lite.detector import CELL
 from deltas_nets.network.paper.resnet import ResNet50
@@ -17,8 +19,8 @@ from deltas_nets.network.paper.sparse_densifier import (
 )
 from deltas_nets.network.paper.superpoint_head import DescriptorHead, DetectorHead
 from deltas_nets.network.paper.taps import Taps, imagenet_normalised
-from deltas_nets.network.paper.up_projection import insert_zeros
 from deltas_nets.reference.batch import batch_and_views
+from deltas_nets.reference.enlarge import enlarge_by_rows
 from deltas_nets.reference.features import heatmap_of, shown_features
 from deltas_nets.reference.keypoints import DetectedKeypoints, fill_keypoints, pick_keypoints
 from deltas_nets.reference.outputs import (
@@ -36,13 +38,6 @@ from deltas_nets.reference.segments import reference_segments, segment_samples
 Indices = Tensor | Sequence[int]
 
 
-def enlarge_by_rows(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """Zeros between the pixels, or the nearest pixel where the rows alone are no multiple."""
-    if size[0] % x.shape[-2] == 0:
-        return insert_zeros(x, size)
-    return F.interpolate(x, size=size, mode="nearest")
-
-
 class ReferenceNetwork(nn.Module):
     """Runs a published checkpoint; made by :func:`deltas_nets.reference.load`.
 
@@ -50,6 +45,9 @@ class ReferenceNetwork(nn.Module):
     whole number of 8x8 cells in height and width: with others the original could not run. All
     methods take tensors on the network's device.
     """
+
+    side_multiple = CELL
+    """Of images, in height and width."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -246,6 +244,25 @@ class ReferenceNetwork(nn.Module):
             features.taps.of_first(1), keypoints, matched.points_3d, matched.in_range
         )
         return ReferenceOutputs(*shown_features(features), *detected, *matched, *densified)
+
+    def forward(
+        self, images: Tensor, views: PosedViews, *, num_keypoints: int = 512
+    ) -> ReferencePrediction:
+        """As :meth:`predict`, called as networks of deltas are; random points are always the same.
+
+        Args:
+            images: as for :meth:`predict`.
+            views: ``(1 + V)``; the anchor's K is that of all.
+            num_keypoints: key points in all.
+        """
+        poses = views.cam_from_world
+        return self.predict(
+            images,
+            views.K[:1],
+            relative_pose(poses[1:], poses[:1])[None],
+            num_points=num_keypoints,
+            generator=torch.Generator().manual_seed(0),
+        )
 
     @torch.no_grad()
     def predict(

@@ -1,4 +1,4 @@
-"""What a run of the published network shows of itself: every intermediate by name."""
+"""What a run of the reference network shows of itself: every intermediate by name."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Triangulation of the published network, and the sparse depth image it draws."""
+"""Triangulation of the reference network, and the sparse depth image it draws."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Score maps of the published network, the matches and the weights it reads from them."""
+"""Score maps of the reference network, the matches and the weights it reads from them."""
 
 from typing import NamedTuple
 

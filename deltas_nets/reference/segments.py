@@ -1,4 +1,4 @@
-"""Segments of the published network: kept whole or dropped, never clipped.
+"""Segments of the reference network: kept whole or dropped, never clipped.
 
 Nothing asks whether a point is in front of the source camera. The ends come from two
 projections, the direction from the fundamental matrix.
@@ -20,7 +20,7 @@ OFFSETS = (-1.0, 0.0, 1.0)
 
 
 class ReferenceSegments(NamedTuple):
-    """Where the published network searches; a dropped segment is a point at pixel (0, 0).
+    """Where the reference network searches; a dropped segment is a point at pixel (0, 0).
 
     Attributes:
         near: ``(B, V, N, 2)`` pixel of the key point at the near depth, before any test.

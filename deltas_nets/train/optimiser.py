@@ -1,10 +1,9 @@
 """AdamW, and the learning rate of every step."""
 
-import math
-
 import torch
 
 from deltas_nets.config import TrainConfig
+from deltas_nets.config.schedule import rate_factor
 from deltas_nets.network.deltas import Deltas
 
 
@@ -30,15 +29,7 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, step: int, config: Train
     Returns:
         The rate of the group that learns fastest.
     """
-    factor = learning_rate_factor(step, config)
+    factor = rate_factor(step, config.steps, warmup=config.warmup, schedule=config.schedule)
     for group in optimizer.param_groups:
         group["lr"] = group["peak"] * factor
     return float(max(group["lr"] for group in optimizer.param_groups))
-
-
-def learning_rate_factor(step: int, config: TrainConfig) -> float:
-    """Linear warm-up, then what the config's schedule says."""
-    warm = min(1.0, (step + 1) / max(1, min(config.warmup, config.steps // 10)))
-    if config.schedule == "constant":
-        return warm
-    return warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / config.steps)))

@@ -1,6 +1,5 @@
 """Run a recipe part by part; a run that was stopped goes on in the part that was not finished."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from deltas_nets.train.checkpoint import CHECKPOINT
 from deltas_nets.train.fit import fit
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.start import Start
-from deltas_nets.weights_file import load_model, read_metadata, save_weights
+from deltas_nets.weights_file import load_model, read_metadata, save_weights, sha256_of
 
 RECORD = "recipe.json"
 
@@ -72,8 +71,7 @@ def begin(folder: Path, beginning: Beginning) -> None:
 def _fingerprint(file: Path | None) -> str | None:
     if file is None:
         return None
-    with file.open("rb") as opened:
-        return f"{file.name}, SHA-256 {hashlib.file_digest(opened, 'sha256').hexdigest()}"
+    return f"{file.name}, SHA-256 {sha256_of(file)}"
 
 
 def run_parts(

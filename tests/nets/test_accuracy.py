@@ -13,6 +13,7 @@ from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import read_view_sets
 from deltas_nets.evaluate.capture import CaptureScores, evaluate_network
 from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.ours import DeltasPredictor
 
 pytestmark = pytest.mark.shared
 
@@ -26,7 +27,7 @@ def hololens(shared_data: Path) -> Path:
 def seven_views(hololens: Path) -> CaptureScores:
     capture = open_capture(hololens)
     view_sets = read_view_sets(hololens / "view_sets.json", capture)
-    return evaluate_network(load_model(), capture, view_sets, PredictConfig())
+    return evaluate_network(DeltasPredictor(load_model()), capture, view_sets, PredictConfig())
 
 
 @pytest.fixture(scope="module")
@@ -85,5 +86,5 @@ def test_views_chosen_by_ourselves_do_as_well(hololens: Path, scores: dict) -> N
     capture = open_capture(hololens)
     anchors = [views.anchor for views in read_view_sets(hololens / "view_sets.json", capture)]
     chosen = choose_view_sets(capture, 3, anchors=anchors[::3])
-    found = evaluate_network(load_model(), capture, chosen, PredictConfig())
+    found = evaluate_network(DeltasPredictor(load_model()), capture, chosen, PredictConfig())
     assert found.dense.abs_rel < 1.25 * scores["dense"]["abs_rel"]

@@ -30,7 +30,8 @@ from deltas_nets.evaluate.rooms import (
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.calibration import NUM_KNOTS, VIEWS, Curve, SpreadCalibration
 from deltas_nets.predict.depth_map import PredictConfig, frames_of
-from deltas_nets.predict.ours import predict_frame
+from deltas_nets.predict.encoded_frames import EncodedFrames
+from deltas_nets.predict.ours import DeltasPredictor, predict_frame
 from deltas_nets.rooms import Rooms
 from deltas_nets.weights_file import load_weights, read_metadata, save_weights
 
@@ -431,11 +432,11 @@ def test_a_captures_deviations_are_those_of_its_maps(
 ) -> None:
     capture = open_capture(make_capture())
     sets, model = choose_view_sets(capture, 2), load_model(weights)
-    found = evaluate_network(model, capture, sets, PredictConfig()).calibration
+    found = evaluate_network(DeltasPredictor(model), capture, sets, PredictConfig()).calibration
     assert found is not None and found.pixels == len(sets) * 48 * 64  # the truth has no holes
-    expected = []
+    encode, expected = EncodedFrames(model), []
     for views in sets:
-        prediction = predict_frame(model, frames_of(capture, views), PredictConfig()).prediction
+        prediction = predict_frame(encode, frames_of(capture, views), PredictConfig()).prediction
         expected.append((prediction.std / prediction.depth).mean().item())
     mean = np.mean([decile.std for decile in found.deciles])
     assert mean == pytest.approx(np.mean(expected), rel=1e-3)

@@ -427,13 +427,13 @@ def test_the_command_prints_and_writes(
     assert "MVDepthNet" in capsys.readouterr().out
     with pytest.raises(UserError, match="2 views"):
         run_cost({"net": small}, num_views=1)
-    with pytest.raises(UserError, match="published takes multiples of 8, not 100 x 128"):
-        run_cost({"published": ReferenceNetwork()}, image_size=(100, 128))
-    both = {"published": ReferenceNetwork(), "net": small}
+    with pytest.raises(UserError, match="reference takes multiples of 8, not 100 x 128"):
+        run_cost({"reference": ReferenceNetwork()}, image_size=(100, 128))
+    both = {"reference": ReferenceNetwork(), "net": small}
     run_cost(both, image_size=(100, 128), num_keypoints=64, repeats=1)
     said = capsys.readouterr()
-    assert "net: 2 views" in said.out and "published:" not in said.out
-    assert "published takes multiples of 8" in said.err
+    assert "net: 2 views" in said.out and "reference:" not in said.out
+    assert "reference takes multiples of 8" in said.err
 
 
 def test_the_command_warns_of_what_it_cannot_count(capsys: pytest.CaptureFixture[str]) -> None:

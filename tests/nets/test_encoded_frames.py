@@ -124,7 +124,7 @@ def see(remember: EncodedFrames, frames: Sequence[Frame], *ids: int) -> None:
 
 def test_a_map_does_not_depend_on_what_was_seen_before(model: Deltas, frames: list[Frame]) -> None:
     config = PredictConfig(work_size=SIZE)
-    alone = predict_frame(model, frames[:3], config)
+    alone = predict_frame(EncodedFrames(model), frames[:3], config)
     remember = EncodedFrames(model)
     predict_frame(remember, [frames[2], frames[4]], config)
     after = predict_frame(remember, frames[:3], config)

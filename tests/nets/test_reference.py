@@ -10,7 +10,7 @@ import pytest
 import skimage.data
 import torch
 from numpy.typing import NDArray
-from published_tables import formula_tensor
+from reference_tables import formula_tensor
 from torch import Tensor
 
 from deltas_nets import reference

@@ -1,4 +1,4 @@
-"""What the published network's rules do where its arrays do not show it."""
+"""What the reference network's rules do where its arrays do not show it."""
 
 import math
 
@@ -11,8 +11,8 @@ from torch.testing import assert_close
 from deltas_geom.checks import ShapeError
 from deltas_nets.network.paper.up_projection import insert_zeros
 from deltas_nets.reference import fill_keypoints, metric_result, pick_keypoints
+from deltas_nets.reference.enlarge import enlarge_by_rows
 from deltas_nets.reference.metrics import mean_result
-from deltas_nets.reference.network import enlarge_by_rows
 from deltas_nets.reference.outputs import (
     DensifyOutputs,
     FeatureOutputs,

@@ -14,6 +14,7 @@ from deltas_geom import PosedViews, fundamental_between, in_image, project, unpr
 from deltas_nets import load_model
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
+from deltas_nets.config.schedule import rate_factor
 from deltas_nets.datasets.augment import (
     Photometry,
     choose_views,
@@ -30,7 +31,6 @@ from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit
 from deltas_nets.train.loader import Part, StepSampler, room_loader
 from deltas_nets.train.log import drop_later_entries
-from deltas_nets.train.optimiser import learning_rate_factor
 from deltas_nets.train.step import Stepper, StepResult
 
 CONFIG = TrainConfig(
@@ -376,8 +376,7 @@ def test_photometry_keeps_range_and_differs_between_views() -> None:
 
 
 def test_the_learning_rate_rises_then_falls_to_a_hundredth() -> None:
-    config = replace(CONFIG, steps=1000, warmup=100)
-    rates = [learning_rate_factor(step, config) for step in range(1000)]
+    rates = [rate_factor(step, 1000, warmup=100) for step in range(1000)]
     assert rates.index(max(rates)) in range(90, 130)
     assert rates[-1] < 0.011
     assert rates[0] < 0.02

@@ -1,6 +1,6 @@
 """The paper's stages around its backbones, in the shapes that :class:`Deltas` composes.
 
-Where the published network departs from the paper the paper is followed; what the weights of its
+Where the reference network departs from the paper the paper is followed; what the weights of its
 authors need is in :mod:`deltas_nets.reference`.
 """
 

@@ -48,7 +48,7 @@ class DecoderMaps(NamedTuple):
 class DepthScales(NamedTuple):
     """What the decoder predicts at four scales, linear and without bounds.
 
-    It is depth in metres in the published network, where nothing keeps it positive.
+    It is depth in metres in the reference network, where nothing keeps it positive.
 
     Attributes:
         full: ``(B, 1, H, W)``.

@@ -1,4 +1,4 @@
-"""`deltas depth` and `deltas evaluate` with the checkpoint that the paper's authors published."""
+"""`deltas depth` and `deltas evaluate` with the checkpoint that the paper's authors predicting."""
 
 import json
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from published_tables import Tables, formula_tensor, random_tables
+from reference_tables import Tables, formula_tensor, random_tables
 from run_command import Run, assert_one_line
 from torch.testing import assert_close
 
@@ -19,9 +19,8 @@ from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.products import read_depth_png, read_points_ply
-from deltas_nets.predict import reference as published
-from deltas_nets.predict.predictor import load_network
-from deltas_nets.reference import ReferenceNetwork
+from deltas_nets.predict import reference as predicting
+from deltas_nets.predict.predictor import load_predictor
 from deltas_nets.weights_file import weights_file
 
 MakeCapture = Callable[..., Path]
@@ -53,7 +52,7 @@ def test_the_command_writes_what_the_network_says(
     assert sorted(path.name for path in out.iterdir()) == ["depth", "points", "summary.json"]
     capture, network = open_capture(folder), reference.load(checkpoint)
     frames = [capture.frame(0), capture.frame(1)]
-    expected = published.predict_published(network, frames, work_size=(48, 64)).depth[0].numpy()
+    expected = predicting.predict_reference(network, frames, work_size=(48, 64)).depth[0].numpy()
     depth = read_depth_png(out / "depth" / "0.png")
     assert (expected > 0).mean() > 0.9  # else there is nothing to see
     assert np.abs(depth - np.maximum(expected, 0)).max() < 0.0006  # m
@@ -101,9 +100,9 @@ def test_points_that_the_dense_map_does_not_rest_on_have_no_depth(
 ) -> None:
     capture, network = open_capture(make_capture()), reference.load(checkpoint)
     frames = [capture.frame(0), capture.frame(1)]
-    found = published.predict_published(network, frames, work_size=(48, 64))
-    generator = torch.Generator().manual_seed(published.SEED)
-    matched = network.predict(*published.load_input(frames, (48, 64)), generator=generator).matched
+    found = predicting.predict_reference(network, frames, work_size=(48, 64))
+    generator = torch.Generator().manual_seed(predicting.SEED)
+    matched = network.predict(*predicting.load_input(frames, (48, 64)), generator=generator).matched
     drawn = []
     for seen, z in zip(
         matched.in_range[0, 0].tolist(), matched.points_3d[0, :, 2].tolist(), strict=True
@@ -123,6 +122,10 @@ def test_what_it_cannot_do_is_one_line_and_nothing_is_written(
     assert_one_line(run(*base, "--min-confidence", 0.5), "states no confidence")
     assert_one_line(run("demo", "--weights", checkpoint, "--out", out), "use deltas depth")
     assert_one_line(run(*base, "--precision", "bfloat16"), "float32 alone", "leave it out")
+    rooms = run("evaluate", "--rooms", 1, "--weights", checkpoint)
+    assert_one_line(rooms, "the reference network", "name a capture")
+    exported = run("export", "--weights", checkpoint, "--out", tmp_path / "a.onnx")
+    assert_one_line(exported, "the reference network", "name weights of deltas train")
     assert not out.exists()
 
 
@@ -156,9 +159,9 @@ def test_a_damaged_checkpoint_names_what_is_missing(
 def test_contents_decide_and_not_names(tmp_path: Path, checkpoint: Path) -> None:
     renamed = tmp_path / "mine.bin"
     renamed.write_bytes(checkpoint.read_bytes())
-    assert isinstance(load_network(renamed), ReferenceNetwork)
+    assert not load_predictor(renamed).states_confidence
     renamed.write_bytes(weights_file("deltas-small").read_bytes())
-    assert not isinstance(load_network(renamed), ReferenceNetwork)
+    assert load_predictor(renamed).states_confidence
 
 
 def turned_frames(folder: Path, *, centre: tuple[float, float, float]) -> list[Frame]:
@@ -173,7 +176,7 @@ def turned_frames(folder: Path, *, centre: tuple[float, float, float]) -> list[F
 def test_frames_are_prepared_as_the_original_did(make_capture: MakeCapture) -> None:
     folder = make_capture(num_frames=2, image_size=(60, 100), origin=(4000.0, 0, 0))
     turned = turned_frames(folder, centre=(4000.3, 0.1, -0.2))  # far from the world's origin
-    given = published.load_input(turned, (48, 64))
+    given = predicting.load_input(turned, (48, 64))
     for image, frame in zip(given.images, turned, strict=True):
         pixels = frame.read_image().astype(np.float32)
         resized = cv2.resize(pixels, (64, 48), interpolation=cv2.INTER_LINEAR)
@@ -192,19 +195,19 @@ def test_frames_are_prepared_as_the_original_did(make_capture: MakeCapture) -> N
 
 def test_cameras_in_one_place_are_exactly_so(make_capture: MakeCapture) -> None:
     frames = turned_frames(make_capture(origin=(3.1, -2.7, 11.3)), centre=(3.1, -2.7, 11.3))
-    given = published.load_input(frames, (48, 64))
+    given = predicting.load_input(frames, (48, 64))
     assert not given.cam_from_anchor[..., :3, 3].any()
 
 
 def test_one_camera_for_all_frames_or_an_error(capture: Capture) -> None:
     frames = [capture.frame(0), capture.frame(1)]
-    published.check_cameras(frames, work_size=(48, 64))
+    predicting.check_cameras(frames, work_size=(48, 64))
     K = frames[1].K.copy()
     K[0, 0] += 0.6  # pixels; the images are of the work size
     zoomed = Frame(7, frames[1].image_path, frames[1].image_size, K, frames[1].cam_from_world)
     with pytest.raises(UserError, match="frame 7 has another than frame 0"):
-        published.check_cameras([*frames, zoomed], work_size=(48, 64))
-    published.check_cameras([*frames, zoomed], work_size=(24, 32))
+        predicting.check_cameras([*frames, zoomed], work_size=(48, 64))
+    predicting.check_cameras([*frames, zoomed], work_size=(24, 32))
 
 
 @pytest.mark.shared
@@ -250,7 +253,7 @@ def test_formula_weights_at_the_size_of_the_original(
         level,
         torch.from_numpy(arrays["intrinsics"]).float(),
         torch.from_numpy(arrays["cam_from_anchor"]).float(),
-        generator=torch.Generator().manual_seed(published.SEED),
+        generator=torch.Generator().manual_seed(predicting.SEED),
     )
     depth = read_depth_png(out / "depth" / "0.png")
     wanted = np.maximum(expected.depth[0, 0].numpy(), 0)

@@ -1,6 +1,7 @@
 """The demo: a real stereo pair in, depth, errors, times and a figure out."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -11,7 +12,7 @@ from rich.table import Table
 from deltas_nets import __version__
 from deltas_nets.captures.motorcycle import motorcycle
 from deltas_nets.config import to_dict
-from deltas_nets.cost.stages_timed import timed_stages
+from deltas_nets.cost.stages import Lap, timed_stages
 from deltas_nets.evaluate.depth_metrics import depth_metrics
 from deltas_nets.evaluate.figure import draw_prediction
 from deltas_nets.evaluate.points import median_point_error, score_points
@@ -20,7 +21,11 @@ from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.folder import prepare_output
 from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import predict_frame
+
+STAGES = ("encoder", "detector", "descriptor", "matcher", "densifier")
+BETWEEN = "triangulation and sparse depth"
 
 
 def run_demo(
@@ -45,9 +50,10 @@ def run_demo(
         head={"versions": {"deltas-depth": __version__, "torch": torch.__version__}},
     )
     started = time.perf_counter()
-    with timed_stages(model) as seconds:
-        result = predict_frame(model, [pair.left, pair.right], config)
+    with timed_stages(model) as laps:
+        result = predict_frame(EncodedFrames(model), [pair.left, pair.right], config)
     elapsed = time.perf_counter() - started
+    seconds = _seconds_by_stage(laps)
     dense = depth_metrics(result.depth, pair.depth, depth_range=config.depth_range)
     sparse = score_points(result.prediction, pair.depth, config.depth_range)
     assert dense is not None
@@ -76,6 +82,15 @@ def run_demo(
     console.print(f"sparse median error {100 * median:.2f} %")
     console.print(_stage_table(seconds))
     console.print(f"figure in {figure}, depth in {folder.file('depth', 'left')}", soft_wrap=True)
+
+
+def _seconds_by_stage(laps: Sequence[Lap]) -> dict[str, float]:
+    """Seconds of each stage, and from the first to the last of them."""
+    seconds = dict.fromkeys((*STAGES, BETWEEN), 0.0)
+    # Before the first stage images are read, and after the last one results are resized.
+    for name, time_of_lap in laps[1:-1]:
+        seconds[name if name in STAGES else BETWEEN] += time_of_lap
+    return seconds | {"total": sum(seconds.values())}
 
 
 def _stage_table(seconds: dict[str, float]) -> Table:

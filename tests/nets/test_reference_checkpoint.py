@@ -1,4 +1,4 @@
-"""The published network's file: what loads, what is refused; and the page of differences."""
+"""The reference network's file: what loads, what is refused; and the page of differences."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from published_tables import Tables, random_tables
+from reference_tables import Tables, random_tables
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -227,7 +227,7 @@ def test_the_page_of_differences_is_up_to_date() -> None:
 def test_every_difference_is_told_in_full() -> None:
     assert [row.number for row in DIFFERENCES] == list(range(1, 28))
     for row in DIFFERENCES:
-        told = (row.topic, row.paper, row.published, row.deltas)
+        told = (row.topic, row.paper, row.reference, row.deltas)
         assert all(text.strip() == text and len(text) > 3 for text in told), row.number
         assert not any("|" in text for text in told), row.number
     assert len({row.topic for row in DIFFERENCES}) == 27
