@@ -89,6 +89,11 @@ def _no_images(folder: Path) -> None:
         path.write_bytes(b"")
 
 
+def _turned(folder: Path) -> None:
+    for file in (folder / "color").iterdir():
+        Image.open(file).transpose(Image.Transpose.ROTATE_90).save(file)
+
+
 POSE, K_FILE = "pose/1.txt", "intrinsic/intrinsic_color.txt"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -114,6 +119,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "negative focal": (_intrinsics("-9 0 32 0 9 24 0 0 1"), K_FILE),
     "transposed K": (_intrinsics("9 0 0 0 9 0 32 24 1"), K_FILE),
     "larger images' K": (_intrinsics("90 0 65 0 90 48 0 0 1"), K_FILE),
+    "turned images": (_turned, K_FILE),
     "smaller images' K": (_intrinsics("9 0 16 0 9 12 0 0 1"), K_FILE),
 }
 """What breaks a capture, and the file or folder that the error names."""

@@ -63,28 +63,12 @@ def test_a_grey_image_is_read_as_colour(make_capture: MakeCapture) -> None:
     assert open_capture(folder).frame(0).read_image().shape == (48, 64, 3)
 
 
-def test_a_frame_without_depth_says_so(make_capture: MakeCapture) -> None:
-    frame = open_capture(make_capture(depth_size=None)).frame(0)
-    assert frame.depth_path is None and frame.depth_K is None
-    with pytest.raises(UserError) as error:
-        frame.read_depth()
-    line_of(error, "frame 0", "no sensor depth")
-
-
 @pytest.mark.parametrize("nest", ["scans", "scans_test"])
 def test_a_single_nested_scene_is_found(
     make_capture: MakeCapture, tmp_path: Path, nest: str
 ) -> None:
     make_capture(path=tmp_path / "top" / nest / "scene0000_00")
     assert open_capture(tmp_path / "top").path == tmp_path / "top" / nest / "scene0000_00"
-
-
-def test_several_nested_scenes_are_listed(make_capture: MakeCapture, tmp_path: Path) -> None:
-    for name in ("scene0000_00", "scene0001_00"):
-        make_capture(path=tmp_path / "top" / "scans" / name)
-    with pytest.raises(UserError) as error:
-        open_capture(tmp_path / "top")
-    line_of(error, "scans/scene0000_00, scans/scene0001_00", "name one")
 
 
 @pytest.mark.parametrize("value", ["nan", "-inf", "inf"])
@@ -128,60 +112,12 @@ def test_a_broken_capture_is_one_line_that_names_the_file(
     line_of(error)
 
 
-def test_a_path_that_is_no_capture_says_what_one_is(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "nest" / "scans").mkdir(parents=True)
-    for name, what in [
-        ("nowhere", "does not exist"),
-        ("file", "not a folder"),
-        ("empty", "no capture"),
-        ("nest", "no scene inside"),
-    ]:
-        with pytest.raises(UserError) as error:
-            open_capture(tmp_path / name)
-        line_of(error, str(tmp_path / name), what)
-
-
 def test_a_three_by_three_is_as_good_as_four_by_four(make_capture: MakeCapture) -> None:
     folder = make_capture()
     (folder / K_FILE).write_text("60 0 32 0 0 60 24 0 0 0 1 0 0 0 0 1")
     four = open_capture(folder).frame(0).K
     (folder / K_FILE).write_text("60 0 32 0 60 24 0 0 1")
     assert np.array_equal(four, open_capture(folder).frame(0).K)
-
-
-@pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_a_truncated_image_opens_but_does_not_read(make_capture: MakeCapture, suffix: str) -> None:
-    folder = make_capture()
-    path = folder / "color" / f"1.{suffix}"
-    image = Image.open(folder / "color" / "0.jpg")
-    (folder / "color" / "1.jpg").unlink()
-    image.save(path)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    frame = open_capture(folder).frame(1)
-    with pytest.raises(UserError) as error:
-        frame.read_image()
-    line_of(error, str(path), "truncated")
-
-
-def test_an_image_of_another_size_or_type_does_not_read(make_capture: MakeCapture) -> None:
-    folder = make_capture()
-    Image.new("RGB", (32, 24)).save(folder / "color" / "1.jpg")
-    (folder / "color" / "2.jpg").unlink()
-    Image.fromarray(np.zeros((48, 64), np.uint16)).save(folder / "color" / "2.png")
-    (folder / "depth" / "3.png").unlink()
-    Image.new("L", (64, 48)).save(folder / "depth" / "3.png")
-    capture = open_capture(folder)
-    with pytest.raises(UserError) as error:
-        capture.frame(1).read_image()
-    line_of(error, str(folder / "color" / "1.jpg"), "32x24", "64x48")
-    with pytest.raises(UserError) as error:
-        capture.frame(2).read_image()
-    line_of(error, str(folder / "color" / "2.png"), "8-bit")
-    with pytest.raises(UserError) as error:
-        capture.frame(3).read_depth()
-    line_of(error, str(folder / "depth" / "3.png"), "16-bit")
 
 
 @settings(deadline=None)

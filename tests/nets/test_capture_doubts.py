@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from run_command import Run, assert_one_line
+from run_command import Run
 from small_scannet import SCANNET, opened
 
 from deltas_nets.captures.capture import Capture, Frame
@@ -27,20 +27,6 @@ def write_depth(file: Path, size: tuple[int, int]) -> None:
     Image.fromarray(np.full(size, 2500, np.uint16)).save(file)
 
 
-def test_depth_of_another_size_is_refused_as_images_are(
-    run: Run, make_capture: MakeCapture, tmp_path: Path
-) -> None:
-    folder = make_capture(image_size=(96, 128), depth_size=(48, 64))
-    write_depth(folder / "depth" / "2.png", (24, 32))
-    file = str(folder / "depth" / "2.png")
-    words = "depth is 32x24, the intrinsics are for 64x48"
-    assert_one_line(run("evaluate", folder, "--json", tmp_path / "s.json"), words, file)
-    (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
-    words = "depth is 32x24, the others are 64x48"
-    assert_one_line(run("evaluate", folder, "--json", tmp_path / "s.json"), words, file)
-    assert not (tmp_path / "s.json").exists()
-
-
 def test_training_refuses_depth_of_another_size(scannet_copy: Path, tmp_path: Path) -> None:
     write_depth(scannet_copy / "scans" / "scene0000_00" / "depth" / "3.png", (48, 64))
     for cache in (None, tmp_path / "kept", tmp_path / "kept"):
@@ -54,16 +40,6 @@ def test_damaged_depth_is_no_obstacle_to_what_needs_none(make_capture: MakeCaptu
     for file in (folder / "depth").iterdir():
         file.write_bytes(b"")
     assert open_capture(folder).frame(0).depth_size is None
-
-
-def test_turned_images_are_told_from_scaled_ones(make_capture: MakeCapture) -> None:
-    folder = make_capture()
-    for file in (folder / "color").iterdir():
-        Image.open(file).transpose(Image.Transpose.ROTATE_90).save(file)
-    with pytest.raises(UserError) as error:
-        open_capture(folder)
-    assert "images of 48x64 are rotated by 90 degrees" in str(error.value)
-    assert "is of 64x48" in str(error.value) and "intrinsic_color.txt" in str(error.value)
 
 
 @given(
@@ -172,14 +148,3 @@ def test_more_views_than_go_together_is_a_warning(
     (said,) = warnings_of(run, folder, tmp_path / "chosen", "--views", 100)
     assert said.startswith("no map is from 100 views: there are at most ")
     assert warnings_of(run, folder, tmp_path / "few", "--views", 3, "--view-sets", sets) == []
-
-
-def test_a_cut_image_needs_no_view_sets(
-    run: Run, make_capture: MakeCapture, tmp_path: Path
-) -> None:
-    folder = make_capture()
-    file = folder / "color" / "1.jpg"
-    file.write_bytes(file.read_bytes()[:-400])
-    told = run("depth", folder, "--out", tmp_path / "out")
-    assert_one_line(told, str(file), "copy the file again, or remove it")
-    assert not (tmp_path / "out").exists()

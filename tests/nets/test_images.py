@@ -104,3 +104,10 @@ def test_an_image_of_a_lens_that_bends_lines_is_refused(capture: Capture) -> Non
         with pytest.raises(UserError) as error:
             read()
         assert error.value.where == bent.image_path and "SIMPLE_RADIAL 0.1" in error.value.what
+
+
+def test_a_frame_without_depth_says_so(capture: Capture) -> None:
+    blind = replace(capture.frame(0), depth_path=None)
+    for read in (blind.check_depth, blind.read_depth):
+        with pytest.raises(UserError, match="frame 0 has no sensor depth"):
+            read()

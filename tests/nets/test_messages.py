@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
+from PIL import Image
 from small_capture import FAULTS, WRONG_VIEW_SETS, write_capture, write_view_sets
 
 from deltas_nets import cli
@@ -27,6 +28,7 @@ COMMANDS = (
     "depth a-file --out OUT",
     "depth empty --out OUT",
     "depth nest --out OUT",
+    "depth many --out OUT",
     "depth CAPTURE",
     "depth CAPTURE --out CAPTURE",
     "depth CAPTURE --out OUT --vews 3",
@@ -48,19 +50,58 @@ COMMANDS = (
     "evaluate CAPTURE --predictions empty",
     "evaluate BLIND",
     "evaluate --rooms 1 --conditions foo",
+    "evaluate nowhere --json OUT/s.json",
+    "evaluate CAPTURE --json a-file/s.json",
+    "depth CAPTURE --out OUT foo",
     "train --steps abc",
+    "train --out OUT --steps 0",
+    "train --out OUT --sizes 10 10",
+    "train --out OUT --learning-rate nan",
+    "train --out OUT --learning-rate 0",
+    "train --out OUT --data.workers -1",
+    "train --out OUT --data.shelf 0",
+    "train --out OUT --data.replay 5",
+    "train --out OUT --num-keypoints 0",
+    "train --out OUT --network.detector.num-keypoints 2",
+    "train --out OUT --loss.depth inf",
+    "train --out OUT --checkpoint-every 0",
+    "train --out OUT --start-step -1",
+    "train --out OUT --init deltas-large",
+    "train --out OUT --data scannet --encoder none",
+    "train --out OUT --data scannet --root nowhere --encoder none",
+    "train --out OUT --data scannet --root empty --encoder none",
+    "train --out OUT --data scannet --root CAPTURE --encoder none",
+    "train --out OUT --data scannet --root CAPTURE --encoder none --data.split a-file",
+    "train --out OUT --data scannet --root CAPTURE --encoder none --data.split words",
+    "train --out OUT --data scannet --root CAPTURE --encoder none --data.split other",
+    "train --out OUT --data scannet --root CAPTURE --encoder none --data.split none.txt",
+    "train --out a-file",
+    "train --out a-file/run",
     "train --start-step 3",
     "train --out nowhere --resume",
     "calibrate --out weights.bin",
     "export --out network.txt",
     "recipe night --out OUT --effort 0",
 )
-IMAGES = {
-    "cut": lambda file: file.write_bytes(file.read_bytes()[:-400]),
-    "gone": lambda file: file.unlink(),
-    "of another size": lambda file: file.write_bytes(_image("RGB", (32, 24))),
-    "of 16 bits": lambda file: file.write_bytes(_image("I;16", (64, 48))),
+
+
+def image(mode: str, size: tuple[int, int]) -> bytes:
+    file = io.BytesIO()
+    Image.new(mode, size).save(file, format="PNG")
+    return file.getvalue()
+
+
+FILES: dict[str, tuple[str, bytes | int]] = {
+    "a cut JPEG": ("color/1.jpg", -400),
+    "an empty image": ("color/1.jpg", 0),
+    "an image of another size": ("color/1.jpg", image("RGB", (32, 24))),
+    "an image of 16 bits": ("color/1.jpg", image("I;16", (64, 48))),
+    "a cut depth": ("depth/1.png", -40),
+    "depth of another size": ("depth/1.png", image("I;16", (32, 24))),
+    "depth of 8 bits": ("depth/1.png", image("L", (64, 48))),
+    "a pose that is lost": ("pose/1.txt", b"nan " * 16),
 }
+"""Of a frame that a view set names: what the file holds, or how much of it is left."""
 
 
 def lines(folder: Path) -> Iterator[str]:
@@ -72,6 +113,10 @@ def lines(folder: Path) -> Iterator[str]:
     for name in ("empty", "filled"):
         (folder / name).mkdir()
     (folder / "filled" / "notes.txt").write_text("mine")
+    (folder / "words").write_text("two words")
+    (folder / "other").write_text("scene0009_00")
+    for name in ("one", "two"):
+        write_capture(folder / "many" / "scans" / name, num_frames=2)
     prepare_output(folder / "begun", settings={"views": 3})
     for command in COMMANDS:
         yield from _case(folder, f"deltas {command}", command)
@@ -79,12 +124,12 @@ def lines(folder: Path) -> Iterator[str]:
         capture = write_capture(folder / f"with {name}" / "capture")
         break_it(capture)
         yield from _case(folder, name, "depth", capture, "--out", folder / "OUT")
-    for name, damage in IMAGES.items():
-        capture = write_capture(folder / f"image {name}" / "capture")
-        sets = write_view_sets(capture, [{"anchor": 0, "sources": [1]}])
-        damage(capture / "color" / "1.jpg")
-        command = ["depth", capture, "--out", folder / "OUT", "--view-sets", sets]
-        yield from _case(folder, f"image {name}", *command)
+    for name, (file, content) in FILES.items():
+        capture = write_capture(folder / name)
+        whole = (capture / file).read_bytes()
+        (capture / file).write_bytes(whole[:content] if isinstance(content, int) else content)
+        sets = write_view_sets(capture, [{"anchor": 1, "sources": [0]}])
+        yield from _case(folder, name, "evaluate", capture, "--view-sets", sets)
     for content in WRONG_VIEW_SETS:
         sets = write_view_sets(folder, content)
         command = ["depth", folder / "CAPTURE", "--out", folder / "OUT", "--view-sets", sets]
@@ -97,7 +142,7 @@ def _case(folder: Path, name: str, *command: object) -> Iterator[str]:
     if len(words) == 1:
         words = words[0].split()
         names = {path.name for path in folder.iterdir()} | {"OUT", "nowhere"}
-        words = [str(folder / word) if word in names else word for word in words]
+        words = [str(folder / word) if word.split("/")[0] in names else word for word in words]
     said = io.StringIO()
     with (
         mock.patch.object(sys, "argv", ["deltas", *words]),
@@ -108,14 +153,6 @@ def _case(folder: Path, name: str, *command: object) -> Iterator[str]:
         cli.main()
     yield name
     yield from (f"    {line}" for line in said.getvalue().replace(str(folder), "DIR").splitlines())
-
-
-def _image(mode: str, size: tuple[int, int]) -> bytes:
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.new(mode, size).save(file, format="PNG")
-    return file.getvalue()
 
 
 def test_messages_are_those_that_were_read_through(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Outputs: values survive the files, and a folder can be killed, continued and refused."""
 
-import io
 import json
 import os
 import re
@@ -162,23 +161,6 @@ def test_json_takes_what_settings_hold(tmp_path: Path) -> None:
     write_json(tmp_path / "x.json", content)
     text = (tmp_path / "x.json").read_text()
     assert json.loads(text) == {"path": "a", "far": "inf", "n": 3, "x": 0.5}
-
-
-def test_a_write_that_fails_leaves_the_old_file_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "d.png"
-    write_depth_png(path, np.ones((2, 2)))
-    before = files_in(tmp_path)
-
-    def full_disk(self: Image.Image, file: io.BytesIO, **_: object) -> None:
-        file.write(b"half a fi")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Image.Image, "save", full_disk)
-    with pytest.raises(UserError, match=r"cannot be written \(No space left .*d.png: name"):
-        write_depth_png(path, np.full((2, 2), 3.0))
-    assert files_in(tmp_path) == before
 
 
 def test_files_follow_the_umask(tmp_path: Path) -> None:

@@ -64,28 +64,6 @@ def test_a_split_file_keeps_its_order_and_tells_what_is_missing(
     assert chosen.missing == ["scene0001_00"]
 
 
-def test_splits_that_cannot_be_used_are_refused(scannet_root: Path, tmp_path: Path) -> None:
-    def refuse(root: Path, split: object, match: str) -> None:
-        with pytest.raises(UserError, match=match):
-            choose_scenes(root, str(split))
-
-    refuse(tmp_path / "none", "all", r"no such folder, .*none: name the folder that holds scans/")
-    refuse(tmp_path, "all", "no scene in the folder")
-    refuse(
-        scannet_root / "scans_test",
-        "train",
-        "none of the 1 scenes .scene0707_00. is in the split t",
-    )
-    refuse(scannet_root, written_list(tmp_path, "# nothing"), "the split names no scene")
-    refuse(
-        scannet_root, written_list(tmp_path, "scene0009_00"), "none of the 1 scenes of .* is there"
-    )
-    refuse(scannet_root, written_list(tmp_path, "two words"), "line 1 of the split has 2 words")
-    refuse(
-        scannet_root, tmp_path / "none.txt", r"cannot be read .*--data.split.*train, test and all"
-    )
-
-
 def test_a_scene_holds_what_a_capture_of_it_holds(scannet_root: Path) -> None:
     path = scannet_root / "scans" / "scene0000_00"
     scene, capture = read_scene(path), open_capture(path)
