@@ -16,15 +16,15 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     A dim is a number, which must match, or a letter, which must have one size in all
     tensors of the call; after "+" it must not be 0. Leading batch dims are free.
 
-    Numbers are real: integers, which would be rounded to without a word or wrap around, are
-    refused in all but masks (bool) and what is named ``..._index``.
+    Numbers are real: integers, to which results would be rounded without a word, are refused. Not
+    so what is named ``mask``, ``used`` or ``..._index``: :func:`check_bool`, :func:`check_index`.
 
     Args:
         **named: ``name=(tensor, "+V 3 4")``.
 
     Raises:
         ShapeError: a trailing shape differs, or two tensors disagree on a letter.
-        TypeError: not a tensor, or one of integers or complex numbers.
+        TypeError: not a tensor, or not of real numbers.
 
     Example:
         >>> import torch
@@ -36,7 +36,7 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     seen: dict[str, tuple[int, str]] = {}
     for name, (tensor, spec) in named.items():
         check_tensor(**{name: tensor})
-        if not (tensor.dtype == torch.bool or name.endswith("_index")):
+        if name not in ("mask", "used") and not name.endswith("_index"):
             check_floating(**{name: tensor})
         dims = spec.replace("+", "").split()
         shape = tuple(tensor.shape)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
 from deltas_geom.numerics.arithmetic import finite_or_zero, without_autocast
 from deltas_geom.records import Record
@@ -122,8 +122,10 @@ def matches_from_sources(
         covariance: ``(*B, V-1, N, 2, 2)``.
         mask: ``(*B, V-1, N)``.
     """
-    batch = weights.shape[:-2]
+    batch = batch_shape(keypoints.shape[:-2], weights.shape[:-2])
     keypoints, known = finite_or_zero(keypoints)
+    sources = (pixels, -3), (weights, -2), (covariance, -4), (mask, -2)
+    pixels, weights, covariance, mask = (x.expand(*batch, *x.shape[dims:]) for x, dims in sources)
     anchor = keypoints.expand(*batch, *keypoints.shape[-2:]).unsqueeze(-3)
     ones = torch.ones_like(weights[..., :1, :])
     return Matches(

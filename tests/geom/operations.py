@@ -1,212 +1,289 @@
-"""Every public operation with an example of its arguments, for tests that hold of all of them."""
+"""Every public function of named inputs, and every record, for tests that hold of all of them."""
 
+import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 import deltas_geom as geom
+from deltas_geom import PosedViews
 from deltas_geom.testing.fixed_scenes import seeded_scene
-from deltas_geom.testing.scenes import IMAGE_SIZE
+from deltas_geom.testing.scenes import IMAGE_SIZE as SIZE  # most of the scene is in it
 
-SIZE = IMAGE_SIZE  # most of the scene is in it
 RANGE = (0.5, 10.0)
+Inputs = dict[str, Tensor]
+Operation = Callable[..., Any]
 
 
-class Given(NamedTuple):
-    """What operations are tried on: 3 views of 6 points, all with gradients."""
+def inputs_in(dtype: torch.dtype, num: int = 6) -> Inputs:
+    """Three views of ``num`` points without batch dims; the same in each dtype but for rounding."""
+    scene = seeded_scene(3, num_views=3, num_points=max(num, 1), noise=0.5)
+    generator = torch.Generator().manual_seed(0)
 
-    views: geom.PosedViews
-    pixels: Tensor
-    points: Tensor
-    weights: Tensor
-    mask: Tensor
-    descriptors: Tensor
-    maps: Tensor
-    scores: Tensor
-    inv_depths: Tensor
+    def drawn(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
 
-    @property
-    def keypoints(self) -> Tensor:
-        return self.pixels[0]
-
-    @property
-    def rays(self) -> Tensor:
-        return geom.pixel_rays(self.views.K, self.pixels)
-
-    @property
-    def segments(self) -> geom.Segments:
-        return geom.epipolar_segments(
-            self.views, self.keypoints, depth_range=RANGE, image_size=SIZE
-        )
-
-    @property
-    def beside_lines(self) -> geom.Samples:
-        return geom.sample_segments(self.segments, 8, offsets=(-1.0, 0.0, 1.0), image_size=SIZE)
-
-    @property
-    def at_depths(self) -> geom.Samples:
-        return geom.sample_inv_depths(self.views, self.keypoints, self.inv_depths, image_size=SIZE)
-
-
-Operation = Callable[[Given], Any]
-
-
-def _square(given: Given, side: int) -> Tensor:
-    """Identity matrices ``(V, N, side, side)`` with gradients."""
-    like = given.weights
-    identity = torch.eye(side, device=like.device, dtype=like.dtype)
-    return identity * like[..., None, None]
+    views, pixels, points = scene.views, scene.pixels[:, :num], scene.points[:num]
+    segments = geom.epipolar_segments(views, pixels[0], depth_range=RANGE, image_size=SIZE)
+    square = drawn(num, 3, 3)
+    found: Inputs = {
+        "K": views.K,
+        "poses": views.cam_from_world,
+        "pose": views.cam_from_world[0],
+        "other_pose": views.cam_from_world[1],
+        "proj": views.proj,
+        "fundamental": 1e4 * geom.fundamental_between(views),
+        "pixels": pixels,
+        "keypoints": pixels[0],
+        "matched": pixels[1],
+        "points": points,
+        "rays": geom.pixel_rays(views.K, pixels),
+        "weights": 0.3 + drawn(3, num),
+        "depth": geom.project(views, points).depth,
+        "own_depth": geom.project(views, points).depth[0],
+        "own_weights": 0.3 + drawn(num),
+        "homogeneous": geom.to_homogeneous(pixels[0]),
+        "covariance": square @ square.mT + torch.eye(3),
+        "spread": square[:, :2, :2] @ square[:, :2, :2].mT + torch.eye(2),
+        "pose_spread": 1e-6 * torch.eye(6).expand(3, 6, 6),
+        "descriptors": drawn(num, 5),
+        "maps": drawn(2, 5, 12, 16),
+        "scores": drawn(2, num, 3, 8),
+        "logits": drawn(num, 8),
+        "positions": drawn(num, 8, 2),
+        "places": pixels[1:, :, None, None] + torch.arange(8)[:, None],
+        "inv_depths": torch.linspace(0.1, 2, 8).expand(num, 8),
+    }
+    found |= {name: tensor for name, tensor in segments._asdict().items() if name != "status"}
+    found = {name: tensor.to(dtype).contiguous() for name, tensor in found.items()}
+    return found | {"mask": torch.ones(3, num, dtype=torch.bool)}
 
 
-def _tracks(given: Given) -> Any:
-    views, points = given.weights.shape
-    return geom.triangulate_tracks(
-        given.views.proj,
-        given.pixels.flatten(0, 1),
-        torch.arange(views, device=given.pixels.device).repeat_interleave(points),
-        torch.arange(points, device=given.pixels.device).repeat(views),
-        points,
-        given.weights.flatten(),
+def along_lines(K: Tensor, poses: Tensor, keypoints: Tensor) -> geom.Samples:
+    sampler = geom.EpipolarSampler(8, depth_range=RANGE, offsets=(-1.0, 0.0, 1.0))
+    return sampler(PosedViews(K, poses), keypoints, SIZE)
+
+
+def at_depths(K: Tensor, poses: Tensor, keypoints: Tensor, inv_depths: Tensor) -> geom.Samples:
+    return geom.sample_inv_depths(PosedViews(K, poses), keypoints, inv_depths, image_size=SIZE)
+
+
+def samples_at(places: Tensor, mask: Tensor) -> geom.Samples:
+    masks = mask[..., 1:, :, None, None].expand(places.shape[:-1])
+    return geom.Samples(places, places[..., 0, :, 0], masks)
+
+
+def sampled(
+    start: Tensor,
+    end: Tensor,
+    inv_depth_start: Tensor,
+    inv_depth_end: Tensor,
+    foreshortening: Tensor,
+    **options: Any,
+) -> geom.Samples:
+    numbers = [start[..., 0], end[..., 0], inv_depth_start, inv_depth_end, foreshortening]
+    *_, low, high, ratio = torch.broadcast_tensors(*numbers)
+    start, end = (ends.expand(*ratio.shape, 2) for ends in (start, end))
+    status = torch.zeros_like(ratio, dtype=torch.int8)
+    return geom.sample_segments(
+        geom.Segments(start, end, low, high, status, ratio), 4, image_size=SIZE, **options
     )
 
 
-def _refined(given: Given, **options: Any) -> Any:
-    return geom.refine_points(
-        given.views.proj, given.pixels, given.points, given.weights, given.mask, steps=2, **options
+def tracks(proj: Tensor, pixels: Tensor, weights: Tensor) -> Any:
+    """The cameras and points of every item of a batch in one list; its fields by item again."""
+    batch = torch.broadcast_shapes(proj.shape[:-3], pixels.shape[:-3], weights.shape[:-2])
+    size, (views, num) = batch.numel(), pixels.shape[-3:-1]
+    cameras = torch.arange(size * views, device=proj.device).repeat_interleave(num)
+    numbers = torch.arange(size * num, device=proj.device).reshape(size, 1, num)
+    found = geom.triangulate_tracks(
+        proj.expand(*batch, views, 3, 4).reshape(size * views, 3, 4),
+        pixels.expand(*batch, views, num, 2).reshape(size * views * num, 2),
+        cameras,
+        numbers.expand(size, views, num).flatten(),
+        size * num,
+        weights.expand(*batch, views, num).reshape(size * views * num),
+    )
+    rows = (len(field) // max(size, 1) for field in found)
+    return tuple(
+        field.reshape(*batch, count, *field.shape[1:])
+        for field, count in zip(found, rows, strict=True)
     )
 
 
-def _rasterized(given: Given, **options: Any) -> Any:
+def refined(
+    proj: Tensor, pixels: Tensor, points: Tensor, weights: Tensor, mask: Tensor, **options: Any
+) -> geom.Refined:
+    return geom.refine_points(proj, pixels, points, weights, mask, steps=2, **options)
+
+
+def rasterized(
+    keypoints: Tensor, own_depth: Tensor, own_weights: Tensor, mask: Tensor, **options: Any
+) -> geom.SparseDepth:
     return geom.rasterize_depth(
-        given.keypoints,
-        given.weights[0],
-        image_size=SIZE,
-        mask=given.mask[0],
-        weights=given.weights[1],
-        **options,
+        keypoints, own_depth, mask=mask[..., 0, :], weights=own_weights, image_size=SIZE, **options
     )
 
 
 OPERATIONS: dict[str, Operation] = {
-    "camera_centers": lambda g: geom.camera_centers(g.views.cam_from_world),
-    "correlate": lambda g: geom.correlate(g.descriptors, g.maps, g.at_depths, image_size=SIZE),
-    "correlate, lines": lambda g: geom.correlate(
-        g.descriptors, g.maps, g.beside_lines, image_size=SIZE
+    "camera_centers": lambda pose: geom.camera_centers(pose),
+    "correlate": lambda descriptors, maps, places, mask: geom.correlate(
+        descriptors, maps, samples_at(places, mask), image_size=SIZE
     ),
-    "correlate_normalized": lambda g: geom.correlate_normalized(
-        g.descriptors, g.maps, g.at_depths, image_size=SIZE
+    "correlate, lines": lambda descriptors, maps, K, poses, keypoints: geom.correlate(
+        descriptors, maps, along_lines(K, poses, keypoints), image_size=SIZE
     ),
-    "crop_intrinsics": lambda g: geom.crop_intrinsics(g.views.K, left=2, top=1),
-    "depth_variance": lambda g: geom.depth_variance(g.views.proj, _square(g, 3)[0]),
-    "epipolar_distance": lambda g: geom.epipolar_distance(
-        geom.fundamental_between(g.views), g.pixels[0], g.pixels[1]
+    "correlate_normalized": lambda descriptors, maps, places, mask: geom.correlate_normalized(
+        descriptors, maps, samples_at(places, mask), image_size=SIZE
     ),
-    "epipolar_lines": lambda g: geom.epipolar_lines(geom.fundamental_between(g.views), g.pixels[0]),
-    "epipolar_segments": lambda g: g.segments,
-    "from_homogeneous": lambda g: geom.from_homogeneous(g.points),
-    "fundamental_between": lambda g: geom.fundamental_between(g.views, 0, 2),
-    "in_image": lambda g: geom.in_image(g.pixels, image_size=SIZE),
-    "invert_pose": lambda g: geom.invert_pose(g.views.cam_from_world),
-    "is_rigid": lambda g: geom.is_rigid(g.views.cam_from_world),
-    "match_joint": lambda g: geom.match_joint(
-        g.views, g.keypoints, g.scores[:, :, :1], g.at_depths, image_size=SIZE
+    "crop_intrinsics": lambda K: geom.crop_intrinsics(K, left=2, top=1),
+    "depth_variance": lambda proj, covariance: geom.depth_variance(proj, covariance),
+    "epipolar_distance": lambda fundamental, keypoints, matched: geom.epipolar_distance(
+        fundamental, keypoints, matched
     ),
-    "match_per_view": lambda g: geom.match_per_view(g.keypoints, g.scores, g.beside_lines),
-    "normalize_pixels": lambda g: geom.normalize_pixels(g.pixels, image_size=SIZE),
-    "pixel_grid": lambda g: geom.pixel_grid(SIZE, device=g.pixels.device, dtype=g.pixels.dtype),
-    "pixel_rays": lambda g: g.rays,
-    "point_covariance": lambda g: geom.point_covariance(g.views.proj, g.points, g.weights),
-    "point_covariance, poses": lambda g: geom.point_covariance(
-        g.views.proj, g.points, g.weights, pose_covariance=_square(g, 6).sum(dim=1)
+    "epipolar_lines": lambda fundamental, keypoints: geom.epipolar_lines(fundamental, keypoints),
+    "epipolar_segments": lambda K, poses, keypoints: geom.epipolar_segments(
+        PosedViews(K, poses), keypoints, depth_range=RANGE, image_size=SIZE
     ),
-    "project": lambda g: geom.project(g.views, g.points),
-    "rasterize_depth": _rasterized,
-    "rasterize_depth, mean": partial(_rasterized, reduce="mean", splat="bilinear"),
-    "ray_parallax": lambda g: geom.ray_parallax(g.views.proj, g.points, g.mask),
-    "refine_points": _refined,
-    "refine_points, huber": partial(_refined, loss="huber"),
-    "refine_points, implicit": partial(_refined, loss="cauchy", gradient="implicit"),
-    "relative_pose": lambda g: geom.relative_pose(*g.views.cam_from_world[:2]),
-    "reprojection_residual": lambda g: geom.reprojection_residual(
-        g.views.proj, g.points, g.pixels, g.weights
+    "from_homogeneous": lambda homogeneous: geom.from_homogeneous(homogeneous),
+    "fundamental_between": lambda K, poses: geom.fundamental_between(PosedViews(K, poses), 0, 2),
+    "in_image": lambda pixels: geom.in_image(pixels, image_size=SIZE),
+    "invert_pose": lambda pose: geom.invert_pose(pose),
+    "is_rigid": lambda pose: geom.is_rigid(pose),
+    "match_joint": lambda K, poses, keypoints, scores, inv_depths: geom.match_joint(
+        PosedViews(K, poses),
+        keypoints,
+        scores[..., :1, :],
+        at_depths(K, poses, keypoints, inv_depths),
+        image_size=SIZE,
     ),
-    "resize_intrinsics": lambda g: geom.resize_intrinsics(
-        g.views.K, old_size=SIZE, new_size=(24, 32)
+    "match_per_view": lambda keypoints, scores, places, mask: geom.match_per_view(
+        keypoints, scores[..., :1, :], samples_at(places, mask)
     ),
-    "resize_pixels": lambda g: geom.resize_pixels(g.pixels, old_size=SIZE, new_size=(12, 32)),
-    "sample_inv_depths": lambda g: g.at_depths,
-    "sample_map": lambda g: geom.sample_map(g.maps, g.pixels[1:], image_size=SIZE),
-    "sample_segments": lambda g: g.beside_lines,
-    "sample_segments, pixels": lambda g: geom.sample_segments(g.segments, 8, spacing="pixels"),
-    "soft_argmax": lambda g: geom.soft_argmax(g.scores[0, :, 0], g.inv_depths[:, None], window=2),
-    "to_homogeneous": lambda g: geom.to_homogeneous(g.pixels),
-    "triangulate": lambda g: geom.triangulate(
-        g.views.proj, g.pixels, g.weights, g.mask, covariance=True
+    "normalize_pixels": lambda pixels: geom.normalize_pixels(pixels, image_size=SIZE),
+    "pixel_grid": lambda pixels: geom.pixel_grid(SIZE, device=pixels.device, dtype=pixels.dtype),
+    "pixel_rays": lambda K, pixels: geom.pixel_rays(K, pixels),
+    "point_covariance": lambda proj, points, weights: geom.point_covariance(proj, points, weights),
+    "point_covariance, poses": lambda proj, points, weights, pose_spread: geom.point_covariance(
+        proj, points, weights, pose_covariance=pose_spread
     ),
-    "triangulate, alike": lambda g: geom.triangulate(g.views.proj, g.pixels),
-    "triangulate, world": lambda g: geom.triangulate(
-        g.views.proj, g.pixels, g.weights, frame="world"
+    "project": lambda K, poses, points: geom.project(PosedViews(K, poses), points),
+    "rasterize_depth": rasterized,
+    "rasterize_depth, mean": partial(rasterized, reduce="mean", splat="bilinear"),
+    "ray_parallax": lambda proj, points, mask: geom.ray_parallax(proj, points, mask),
+    "refine_points": refined,
+    "refine_points, huber": partial(refined, loss="huber"),
+    "refine_points, implicit": partial(refined, loss="cauchy", gradient="implicit"),
+    "relative_pose": lambda pose, other_pose: geom.relative_pose(pose, other_pose),
+    "reprojection_residual": lambda proj, points, pixels, weights: geom.reprojection_residual(
+        proj, points, pixels, weights
     ),
-    "triangulate_inverse_depth_weighted": lambda g: geom.triangulate_inverse_depth_weighted(
-        g.views.cam_from_world, g.rays, g.weights, g.mask
+    "resize_intrinsics": lambda K: geom.resize_intrinsics(K, old_size=SIZE, new_size=(24, 32)),
+    "resize_pixels": lambda pixels: geom.resize_pixels(pixels, old_size=SIZE, new_size=(12, 32)),
+    "sample_inv_depths": at_depths,
+    "sample_map": lambda maps, pixels: geom.sample_map(
+        maps, pixels[..., 1:, :, :], image_size=SIZE
     ),
-    "triangulate_midpoint": lambda g: geom.triangulate_midpoint(
-        g.views.cam_from_world, g.rays, g.weights, g.mask
+    "sample_segments": partial(sampled, offsets=(-1.0, 0.0, 1.0)),
+    "sample_segments, pixels": partial(sampled, spacing="pixels"),
+    "soft_argmax": lambda logits, positions: geom.soft_argmax(logits, positions, window=2),
+    "to_homogeneous": lambda pixels: geom.to_homogeneous(pixels),
+    "triangulate": lambda proj, pixels, weights, mask: geom.triangulate(
+        proj, pixels, weights, mask, covariance=True
     ),
-    "triangulate_points": lambda g: geom.triangulate_points(g.views.proj, g.pixels),
-    "triangulate_points, weights": lambda g: geom.triangulate_points(
-        g.views.proj, g.pixels, g.weights, g.mask
+    "triangulate, alike": lambda proj, pixels: geom.triangulate(proj, pixels, covariance=True),
+    "triangulate, world": lambda proj, pixels, weights: geom.triangulate(
+        proj, pixels, weights, frame="world", covariance=True
     ),
-    "triangulate_rays": lambda g: geom.triangulate_rays(
-        g.views.cam_from_world, g.rays, g.weights, g.mask
+    "triangulate_inverse_depth_weighted": lambda poses, rays, weights, mask: (
+        geom.triangulate_inverse_depth_weighted(poses, rays, weights, mask)
     ),
-    "triangulate_robust": lambda g: geom.triangulate_robust(
-        g.views.proj, g.pixels, g.weights, g.mask, covariance=True
+    "triangulate_midpoint": lambda poses, rays, weights, mask: geom.triangulate_midpoint(
+        poses, rays, weights, mask
     ),
-    "triangulate_tracks": _tracks,
-    "triangulate_two_view": lambda g: geom.triangulate_two_view(
-        g.views.proj[:2], g.pixels[:2], g.mask[:2]
+    "triangulate_points": lambda proj, pixels: geom.triangulate_points(proj, pixels),
+    "triangulate_points, weights": lambda proj, pixels, weights, mask: geom.triangulate_points(
+        proj, pixels, weights, mask
     ),
-    "unproject": lambda g: geom.unproject(g.views, g.pixels, g.weights),
-    "weights_from_covariance": lambda g: geom.weights_from_covariance(_square(g, 2)),
+    "triangulate_rays": lambda poses, rays, weights, mask: geom.triangulate_rays(
+        poses, rays, weights, mask
+    ),
+    "triangulate_robust": lambda proj, pixels, weights, mask: geom.triangulate_robust(
+        proj, pixels, weights, mask, covariance=True
+    ),
+    "triangulate_tracks": tracks,
+    "triangulate_two_view": lambda proj, pixels, mask: geom.triangulate_two_view(
+        proj[..., :2, :, :], pixels[..., :2, :, :], mask[..., :2, :]
+    ),
+    "unproject": lambda K, poses, pixels, depth: geom.unproject(
+        PosedViews(K, poses), pixels, depth
+    ),
+    "weights_from_covariance": lambda spread: geom.weights_from_covariance(spread),
 }
-"""By name, and what is special after a comma."""
+"""By name, and what is special after a comma; parameters are keys of :func:`inputs_in`."""
 
 METHODS: dict[str, Operation] = {
-    "proj": lambda g: g.views.proj,
-    "select": lambda g: g.views.select(0),
-    "from_opengl": lambda g: geom.PosedViews.from_opengl(*g.views),
-    "from_world_from_cam": lambda g: geom.PosedViews.from_world_from_cam(*g.views),
-    "resize": lambda g: g.views.resize(old_size=SIZE, new_size=(24, 32)),
-    "crop": lambda g: g.views.crop(left=2, top=1),
-    "EpipolarSampler": lambda g: geom.EpipolarSampler(8, depth_range=RANGE)(
-        g.views, g.keypoints, SIZE
+    "proj": lambda K, poses: PosedViews(K, poses).proj,
+    "select": lambda K, poses: PosedViews(K, poses).select(0),
+    "from_opengl": lambda K, poses: PosedViews.from_opengl(K, poses),
+    "from_world_from_cam": lambda K, poses: PosedViews.from_world_from_cam(K, poses),
+    "resize": lambda K, poses: PosedViews(K, poses).resize(old_size=SIZE, new_size=(24, 32)),
+    "crop": lambda K, poses: PosedViews(K, poses).crop(left=2, top=1),
+    "EpipolarSampler": along_lines,
+    "Triangulator": lambda proj, pixels, weights, mask: geom.Triangulator(covariance=True)(
+        proj, pixels, weights, mask
     ),
-    "Triangulator": lambda g: geom.Triangulator()(g.views.proj, g.pixels, g.weights, g.mask),
-    "DepthRasterizer": lambda g: geom.DepthRasterizer()(g.keypoints, g.weights[0], SIZE),
-    "kornia": lambda g: geom.PosedViews.from_kornia(g.views.to_kornia(image_size=SIZE)),
+    "DepthRasterizer": lambda keypoints, own_depth: geom.DepthRasterizer()(
+        keypoints, own_depth, SIZE
+    ),
+    "kornia": lambda K, poses: PosedViews.from_kornia(
+        PosedViews(K, poses).to_kornia(image_size=SIZE)
+    ),
+}
+
+RECORDS: dict[str, Operation] = {
+    "Matches": OPERATIONS["match_joint"],
+    "PosedViews": lambda K, poses: PosedViews(K, poses),
+    "Projection": OPERATIONS["project"],
+    "Refined": refined,
+    "RobustTriangulation": OPERATIONS["triangulate_robust"],
+    "Samples": at_depths,
+    "Segments": OPERATIONS["epipolar_segments"],
+    "SoftArgmax": OPERATIONS["soft_argmax"],
+    "SparseDepth": rasterized,
+    "TriangulatedTracks": lambda proj, keypoints, own_weights: geom.triangulate_tracks(
+        proj[:2], keypoints, torch.arange(6) % 2, torch.arange(6) // 2, 3, own_weights
+    ),
+    "Triangulation": OPERATIONS["triangulate"],
+    "TwoViewTriangulation": OPERATIONS["triangulate_two_view"],
 }
 
 
-def given_in(dtype: torch.dtype) -> Given:
-    """Inputs of all operations, the same whatever the dtype but for rounding."""
-    scene = seeded_scene(3, num_views=3, num_points=6)
-    generator = torch.Generator().manual_seed(0)
+def names_of(operation: Operation) -> list[str]:
+    """Of the inputs that an operation takes."""
+    parameters = inspect.signature(operation).parameters.values()
+    options = inspect.Parameter.VAR_KEYWORD
+    return [each.name for each in parameters if each.default is each.empty and each.kind != options]
 
-    def drawn(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator).to(dtype).requires_grad_()
 
-    return Given(
-        geom.PosedViews(*(tensor.to(dtype).requires_grad_() for tensor in scene.views)),
-        scene.pixels.to(dtype).requires_grad_(),
-        scene.points.to(dtype).requires_grad_(),
-        drawn(3, 6),
-        torch.ones(3, 6, dtype=torch.bool),
-        drawn(6, 5),
-        drawn(2, 5, 12, 16),
-        drawn(2, 6, 3, 8),
-        torch.linspace(0.1, 2, 8, dtype=dtype),
-    )
+def chosen(operation: Operation, inputs: Inputs) -> Inputs:
+    return {name: inputs[name] for name in names_of(operation)}
+
+
+def tensors_of(result: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
+
+
+def is_real(tensor: Tensor) -> bool:
+    return tensor.is_floating_point()
+
+
+def followed(inputs: Inputs) -> Inputs:
+    return {
+        name: tensor.detach().clone().requires_grad_() if is_real(tensor) else tensor
+        for name, tensor in inputs.items()
+    }

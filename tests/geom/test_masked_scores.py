@@ -4,10 +4,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from operations import SIZE, given_in
+from operations import SIZE, at_depths, inputs_in
 from torch import Tensor
 
-from deltas_geom import match_joint, match_per_view, soft_argmax
+from deltas_geom import PosedViews, match_joint, match_per_view, soft_argmax
 from deltas_geom.testing.strategies import vectors
 
 LEFT_OUT = (-torch.inf, torch.inf, torch.nan)
@@ -36,8 +36,9 @@ def test_a_logit_that_is_not_finite_is_a_masked_place(
 
 @pytest.mark.parametrize("value", LEFT_OUT)
 def test_scores_that_are_not_finite_are_samples_not_seen(value: float) -> None:
-    inputs = given_in(torch.float64)
-    views, keypoints, samples = inputs.views, inputs.keypoints, inputs.at_depths
+    inputs = inputs_in(torch.float64)
+    K, poses, keypoints = (inputs[name] for name in ("K", "poses", "keypoints"))
+    views, samples = PosedViews(K, poses), at_depths(K, poses, keypoints, inputs["inv_depths"])
     assert samples.mask.shape[0] == 2 and (samples.mask.sum(dim=0) == 2).any()
     generator = torch.Generator().manual_seed(0)
     scores = torch.rand(samples.mask.shape, generator=generator, dtype=torch.float64)

@@ -1,14 +1,10 @@
 """What operations compute in: the dtypes they are given, whatever autocast says."""
 
-import inspect
-from typing import Any
-
 import pytest
 import torch
-from operations import METHODS, OPERATIONS, RANGE, SIZE, Given, given_in
+from operations import METHODS, OPERATIONS, RANGE, SIZE, chosen, inputs_in, is_real, tensors_of
 from torch import Tensor
 from torch.testing import assert_close
-from torch.utils._pytree import tree_leaves, tree_map
 
 import deltas_geom as geom
 from deltas_geom.numerics.arithmetic import promoted, without_autocast
@@ -16,48 +12,27 @@ from deltas_geom.numerics.arithmetic import promoted, without_autocast
 ALL = OPERATIONS | METHODS
 
 
-def tensors_of(result: Any) -> list[Tensor]:
-    return [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
-
-
-def test_every_public_function_is_tried() -> None:
-    public = {name for name in geom.__all__ if inspect.isfunction(getattr(geom, name))}
-    assert {name.split(",")[0] for name in OPERATIONS} == public
-
-
 @pytest.mark.parametrize("name", ALL)
 def test_autocast_changes_no_bit_of_any_operation(name: str, dtype: torch.dtype) -> None:
-    given = given_in(dtype)
-    wanted = tensors_of(ALL[name](given))
+    given = chosen(ALL[name], inputs_in(dtype))
+    wanted = tensors_of(ALL[name](**given))
     with torch.autocast("cpu", torch.bfloat16):
-        found = tensors_of(ALL[name](given))
+        found = tensors_of(ALL[name](**given))
         assert torch.is_autocast_enabled("cpu")  # it is the caller's, after as before
     for ours, theirs in zip(found, wanted, strict=True):
         assert ours.dtype == theirs.dtype and torch.equal(ours, theirs)
 
 
-def in_one(given: Given, field: str, dtype: torch.dtype) -> Given:
-    """The same with one of its fields in another dtype; ``K`` is that of the views."""
-
-    def cast(value: Any) -> Any:
-        floating = isinstance(value, Tensor) and value.is_floating_point()
-        return value.detach().to(dtype) if floating else value
-
-    if field == "K":
-        return given._replace(views=given.views._replace(K=cast(given.views.K)))
-    return given._replace(**{field: tree_map(cast, getattr(given, field))})
-
-
 # Ends of segments lie on the image's edge, where rounding decides what is in it.
-AT_EDGES = {"sample_segments", "EpipolarSampler", "correlate, lines", "match_per_view"}
+AT_EDGES = {"sample_segments", "sample_segments, pixels", "EpipolarSampler", "correlate, lines"}
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_dtypes_may_be_mixed(name: str) -> None:
-    given = given_in(torch.float32)
-    wanted = tensors_of(ALL[name](given))
-    for field in ("K", *Given._fields):
-        found = tensors_of(ALL[name](in_one(given, field, torch.float64)))
+    given = chosen(ALL[name], inputs_in(torch.float32))
+    wanted = tensors_of(ALL[name](**given))
+    for field in [field for field in given if is_real(given[field])]:
+        found = tensors_of(ALL[name](**given | {field: given[field].double()}))
         for ours, theirs in zip(found, wanted, strict=True):
             assert ours.shape == theirs.shape
             if not ours.is_floating_point():
@@ -70,16 +45,21 @@ def test_dtypes_may_be_mixed(name: str) -> None:
             assert_close(ours.float(), theirs, rtol=0, atol=1e-3 * max(size, 0.1))
 
 
+def cameras_and_points() -> tuple[Tensor, ...]:
+    return tuple(inputs_in(torch.float32)[name] for name in ("K", "poses", "points"))
+
+
 def test_what_is_mixed_is_promoted() -> None:
     half, single = torch.ones(2, dtype=torch.bfloat16), torch.ones(2)
     assert [t.dtype for t in promoted(half, single)] == [torch.float32] * 2
     assert [t.dtype for t in promoted(half, half.half())] == [torch.float32] * 2
     assert [t.dtype for t in promoted(torch.ones(2, dtype=torch.int64), half)] == [half.dtype] * 2
-    given = given_in(torch.float32)
-    views = in_one(given, "K", torch.float64).views
+    K, poses, points = cameras_and_points()
+    views = geom.PosedViews(K.double(), poses)
     assert views.proj.dtype == torch.float64
-    assert geom.project(views, given.points).pixels.dtype == torch.float64
-    assert geom.project(given.views, given.points.double()).depth.dtype == torch.float64
+    assert geom.project(views, points).pixels.dtype == torch.float64
+    single = geom.PosedViews(K, poses)
+    assert geom.project(single, points.double()).depth.dtype == torch.float64
 
 
 def there_and_back(K: Tensor, cam_from_world: Tensor, points: Tensor) -> Tensor:
@@ -91,8 +71,7 @@ def there_and_back(K: Tensor, cam_from_world: Tensor, points: Tensor) -> Tensor:
 
 
 def test_traced_as_one_graph_or_transformed_it_stays_outside_autocast() -> None:
-    given = given_in(torch.float32)
-    inputs = *(tensor.detach() for tensor in given.views), given.points.detach()
+    inputs = cameras_and_points()
     wanted = there_and_back(*inputs)
     torch.compiler.reset()
     traced = torch.compile(there_and_back, fullgraph=True, backend="aot_eager")
@@ -115,8 +94,7 @@ def test_without_autocast_a_graph_holds_no_region_of_it() -> None:
         def forward(self, K: Tensor, cam_from_world: Tensor, points: Tensor) -> Tensor:
             return geom.project(geom.PosedViews(K, cam_from_world), points).pixels
 
-    given = given_in(torch.float32)
-    inputs = *(tensor.detach() for tensor in given.views), given.points.detach()
+    inputs = cameras_and_points()
     names = [str(node.target) for node in torch.export.export(Pixels(), inputs).graph.nodes]
     assert names and not any("autocast" in name for name in names)
 

@@ -5,54 +5,12 @@ from typing import Any
 
 import pytest
 import torch
-from operations import METHODS, OPERATIONS, RANGE, SIZE, Given, given_in
+from operations import OPERATIONS, RANGE, SIZE, at_depths, chosen, inputs_in
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 import deltas_geom as geom
 
-ALL = OPERATIONS | METHODS
-MASKED = [
-    "correlate",
-    "correlate_normalized",
-    "match_joint",
-    "match_per_view",
-    "rasterize_depth",
-    "ray_parallax",
-    "refine_points",
-    "soft_argmax",
-    "triangulate",
-    "triangulate_inverse_depth_weighted",
-    "triangulate_midpoint",
-    "triangulate_points, weights",
-    "triangulate_rays",
-    "triangulate_robust",
-    "triangulate_two_view",
-]
-
-
-def without_points(given: Given) -> Given:
-    views, points, inv_depths = given.views, given.points, given.inv_depths
-    return Given(
-        views,
-        given.pixels[:, :0],
-        points[:0],
-        given.weights[:, :0],
-        given.mask[:, :0],
-        given.descriptors[:0],
-        given.maps,
-        given.scores[:, :0],
-        inv_depths,
-    )
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_no_points_are_fine(name: str) -> None:
-    found = ALL[name](without_points(given_in(torch.float32)))
-    tensors = [leaf for leaf in tree_leaves(found) if isinstance(leaf, Tensor)]
-    assert all(tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point())
-
-
+ALL_INPUTS = inputs_in(torch.float32)
 NO_PROJ, NO_PIXELS, NO_RAYS = torch.zeros(0, 3, 4), torch.zeros(0, 2, 2), torch.zeros(0, 2, 3)
 NO_VIEWS = geom.PosedViews(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4))
 POINTS, NO_WEIGHTS = torch.zeros(2, 3), torch.zeros(0, 2)
@@ -125,34 +83,32 @@ def test_without_places_or_pixels_of_a_map_there_is_an_error_in_words() -> None:
         geom.soft_argmax(torch.zeros(3, 0), torch.zeros(3, 0, 2))
     with pytest.raises(geom.ShapeError, match="feature_map must have h >= 1"):
         geom.sample_map(torch.zeros(5, 0, 4), torch.zeros(2, 2), image_size=SIZE)
-    given = given_in(torch.float32)
+    given = chosen(OPERATIONS["correlate"], inputs_in(torch.float32))
     with pytest.raises(geom.ShapeError, match="feature_map must have w >= 1"):
-        geom.correlate(given.descriptors, given.maps[..., :0], given.at_depths, image_size=SIZE)
+        OPERATIONS["correlate"](**given | {"maps": given["maps"][..., :0]})
 
 
-class WithFloatMasks(Given):
-    """Masks hold numbers."""
-
-    @property
-    def beside_lines(self) -> geom.Samples:
-        samples = super().beside_lines
-        return samples._replace(mask=samples.mask.float())
-
-    @property
-    def at_depths(self) -> geom.Samples:
-        samples = super().at_depths
-        return samples._replace(mask=samples.mask.float())
+def masked_soft_argmax(weights: Tensor, pixels: Tensor, mask: Tensor) -> Any:
+    return geom.soft_argmax(weights, pixels, mask=mask)
 
 
-def masked_soft_argmax(given: Given) -> Any:
-    return geom.soft_argmax(given.weights, given.pixels, mask=given.mask)
+def masked_joint(
+    K: Tensor, poses: Tensor, keypoints: Tensor, inv_depths: Tensor, scores: Tensor, mask: Tensor
+) -> Any:
+    samples = at_depths(K, poses, keypoints, inv_depths)._replace(mask=mask[1:, :, None, None])
+    views = geom.PosedViews(K, poses)
+    return geom.match_joint(views, keypoints, scores[..., :1, :], samples, image_size=SIZE)
+
+
+MASKED = {name: each for name, each in OPERATIONS.items() if "mask" in chosen(each, ALL_INPUTS)}
+MASKED |= {"soft_argmax": masked_soft_argmax, "match_joint": masked_joint}
 
 
 @pytest.mark.parametrize("name", MASKED)
 def test_a_mask_of_numbers_is_an_error_in_words(name: str) -> None:
-    given = WithFloatMasks(*given_in(torch.float32))._replace(mask=torch.ones(3, 6))
+    given = chosen(MASKED[name], ALL_INPUTS)
     with pytest.raises(TypeError, match=r"(mask|used) must be bool, .* got torch\.float32"):
-        (OPERATIONS | {"soft_argmax": masked_soft_argmax})[name](given)
+        MASKED[name](**given | {"mask": given["mask"].float()})
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.bool], ids=str)
