@@ -96,33 +96,33 @@ def _turned(folder: Path) -> None:
 
 POSE, K_FILE = "pose/1.txt", "intrinsic/intrinsic_color.txt"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
-FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
-    "no color": (_remove("color"), ""),
-    "no pose folder": (_remove("pose"), ""),
-    "empty color": (_empty_color, "color"),
-    "two files a frame": (_twice, "color"),
-    "no pose belongs": (_other_numbers, "pose"),
-    "all poses lost": (_all_lost, "pose"),
-    "no image decodes": (_no_images, "color/0.jpg"),
-    "pose of 12": (_pose("1 " * 12), POSE),
-    "empty pose": (_pose(""), POSE),
-    "pose of words": (_pose("hello world"), POSE),
-    "binary pose": (_pose(b"\xff\xfe\x00\x80"), POSE),
-    "scaled pose": (_pose(IDENTITY.replace("1 0 0 0 0", "1.1 0 0 0 0", 1)), POSE),
-    "zero pose": (_pose("0 " * 15 + "1"), POSE),
-    "mirrored pose": (_pose("-" + IDENTITY), POSE),
-    "last row": (_pose(IDENTITY[:-1] + "2"), POSE),
-    "no intrinsics": (_remove(K_FILE), K_FILE),
-    "intrinsics of 12": (_intrinsics("1 " * 12), K_FILE),
-    "intrinsics of words": (_intrinsics("fx fy"), K_FILE),
-    "infinite intrinsics": (_intrinsics("nan 0 32 0 9 24 0 0 1"), K_FILE),
-    "negative focal": (_intrinsics("-9 0 32 0 9 24 0 0 1"), K_FILE),
-    "transposed K": (_intrinsics("9 0 0 0 9 0 32 24 1"), K_FILE),
-    "larger images' K": (_intrinsics("90 0 65 0 90 48 0 0 1"), K_FILE),
-    "turned images": (_turned, K_FILE),
-    "smaller images' K": (_intrinsics("9 0 16 0 9 12 0 0 1"), K_FILE),
+FAULTS: dict[str, Callable[[Path], None]] = {
+    "no color": _remove("color"),
+    "no pose folder": _remove("pose"),
+    "empty color": _empty_color,
+    "two files a frame": _twice,
+    "no pose belongs": _other_numbers,
+    "all poses lost": _all_lost,
+    "no image decodes": _no_images,
+    "pose of 12": _pose("1 " * 12),
+    "empty pose": _pose(""),
+    "pose of words": _pose("hello world"),
+    "binary pose": _pose(b"\xff\xfe\x00\x80"),
+    "scaled pose": _pose(IDENTITY.replace("1 0 0 0 0", "1.1 0 0 0 0", 1)),
+    "zero pose": _pose("0 " * 15 + "1"),
+    "mirrored pose": _pose("-" + IDENTITY),
+    "last row": _pose(IDENTITY[:-1] + "2"),
+    "no intrinsics": _remove(K_FILE),
+    "intrinsics of 12": _intrinsics("1 " * 12),
+    "intrinsics of words": _intrinsics("fx fy"),
+    "infinite intrinsics": _intrinsics("nan 0 32 0 9 24 0 0 1"),
+    "negative focal": _intrinsics("-9 0 32 0 9 24 0 0 1"),
+    "transposed K": _intrinsics("9 0 0 0 9 0 32 24 1"),
+    "larger images' K": _intrinsics("90 0 65 0 90 48 0 0 1"),
+    "turned images": _turned,
+    "smaller images' K": _intrinsics("9 0 16 0 9 12 0 0 1"),
 }
-"""What breaks a capture, and the file or folder that the error names."""
+"""What breaks a capture; messages.txt has the error of each."""
 
 _GOOD = {"anchor": 2, "sources": [1]}
 WRONG_VIEW_SETS: list[object] = [

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from small_capture import FAULTS, K_FILE
+from small_capture import K_FILE
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
@@ -17,15 +17,6 @@ from deltas_nets.captures.readers.scannet import world_from_cam_inverse
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]
-
-
-def line_of(error: pytest.ExceptionInfo[UserError], *parts: str) -> None:
-    """The error is one line, has a remedy, and holds these parts."""
-    text = str(error.value)
-    assert "\n" not in text
-    assert error.value.remedy and text.endswith(error.value.remedy)
-    for part in parts:
-        assert part in text, text
 
 
 def test_an_error_is_one_line_of_what_where_remedy() -> None:
@@ -80,7 +71,8 @@ def test_a_pose_that_is_not_finite_is_lost(make_capture: MakeCapture, value: str
     assert list(capture.lost) == ["1"]
     with pytest.raises(UserError) as error:
         capture.frame(1)
-    line_of(error, "frame 1", "not finite", str(folder / "pose" / "1.txt"), "view sets")
+    assert error.value is capture.lost["1"].error
+    assert error.value.where == folder / "pose" / "1.txt"
 
 
 def test_an_image_without_pose_is_lost_and_a_pose_without_image_ignored(
@@ -96,20 +88,8 @@ def test_an_image_without_pose_is_lost_and_a_pose_without_image_ignored(
 def test_an_unknown_frame_names_the_nearest(capture: Capture) -> None:
     with pytest.raises(UserError) as error:
         capture.frame(99)
-    line_of(error, "no frame 99", str(capture.path), "0, 1, 2, 3")
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_broken_capture_is_one_line_that_names_the_file(
-    make_capture: MakeCapture, name: str
-) -> None:
-    break_it, where = FAULTS[name]
-    folder = make_capture()
-    break_it(folder)
-    with pytest.raises(UserError) as error:
-        open_capture(folder)
-    assert error.value.where == folder / where
-    line_of(error)
+    assert "no frame 99" in error.value.what and error.value.where == capture.path
+    assert error.value.remedy.endswith("0, 1, 2, 3")
 
 
 def test_a_three_by_three_is_as_good_as_four_by_four(make_capture: MakeCapture) -> None:

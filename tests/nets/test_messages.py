@@ -120,7 +120,7 @@ def lines(folder: Path) -> Iterator[str]:
     prepare_output(folder / "begun", settings={"views": 3})
     for command in COMMANDS:
         yield from _case(folder, f"deltas {command}", command)
-    for name, (break_it, _) in FAULTS.items():
+    for name, break_it in FAULTS.items():
         capture = write_capture(folder / f"with {name}" / "capture")
         break_it(capture)
         yield from _case(folder, name, "depth", capture, "--out", folder / "OUT")

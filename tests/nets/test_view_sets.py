@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_capture import WRONG_VIEW_SETS, write_view_sets
+from small_capture import write_view_sets
 
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frames import Frames
@@ -42,16 +42,6 @@ def test_sets_are_read_in_order(capture: Capture, tmp_path: Path) -> None:
         tmp_path, [{"anchor": 2, "sources": [1, 3]}, {"anchor": 0, "sources": [1], "note": "x"}]
     )
     assert read_view_sets(path, capture) == (ViewSet("2", ("1", "3")), ViewSet("0", ("1",)))
-
-
-@pytest.mark.parametrize("content", WRONG_VIEW_SETS, ids=str)
-def test_wrong_sets_are_one_line_that_names_the_file(
-    capture: Capture, tmp_path: Path, content: object
-) -> None:
-    path = write_view_sets(tmp_path, content)
-    with pytest.raises(UserError) as error:
-        read_view_sets(path, capture)
-    assert error.value.where == path and error.value.remedy and "\n" not in str(error.value)
 
 
 def test_ids_may_be_strings(capture: Capture, tmp_path: Path) -> None:
