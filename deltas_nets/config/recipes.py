@@ -37,7 +37,7 @@ class Recipe(NamedTuple):
     calibration_size: tuple[int, int] = (288, 384)
 
     def scaled(self, effort: float) -> "Recipe":
-        """The same with a share of the steps and of the rooms to calibrate on, a few at least."""
+        """Take a share of the steps and of the rooms to calibrate on, a few at least."""
         scaled = self._each(lambda c: replace(c, steps=max(1, round(effort * c.steps))))
         rooms = min(500, round(effort * self.calibration_rooms))
         return scaled._replace(calibration_rooms=max(FEWEST_ROOMS, rooms))
@@ -45,11 +45,11 @@ class Recipe(NamedTuple):
     def taught_by(
         self, teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"]
     ) -> "Recipe":
-        """The same with another detector's interest points to learn."""
+        """Let it learn another detector's interest points."""
         return self._each(lambda c: replace(c, teacher=teacher))
 
     def with_workers(self, workers: int) -> "Recipe":
-        """The same with so many processes that render; the result stays."""
+        """Let so many processes render; the result stays."""
         return self._each(lambda c: replace(c, data=replace(c.data, workers=workers)))
 
     def _each(self, change: Callable[[TrainConfig], TrainConfig]) -> "Recipe":

@@ -26,7 +26,7 @@ Formula = Callable[[tuple[Any, ...], Mapping[str, Any], Any], int]
 
 
 def _elements(value: Any) -> int:
-    """Of a tensor, or of the first of several."""
+    """How many elements a tensor has, or the first of several."""
     first = value if isinstance(value, Tensor) else value[0]
     return int(first.numel())
 

@@ -153,7 +153,7 @@ def _timed(model: nn.Module, run: Callable[[], object]) -> Mapping[str, float]:
 
 @contextmanager
 def _evaluating(model: nn.Module) -> Iterator[None]:
-    """In eval mode for the block, then each module as it was."""
+    """Put it in eval mode for the block, then each module back as it was."""
     modes = {module: module.training for module in model.modules()}
     model.eval()
     try:

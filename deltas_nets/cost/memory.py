@@ -51,6 +51,6 @@ class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 def _storages(values: Any) -> dict[int, torch.UntypedStorage]:
-    """Of all tensors in nested containers, each once, by its address."""
+    """The storages of all tensors in nested containers, each once, by its address."""
     tensors = (leaf for leaf in tree_leaves(values) if isinstance(leaf, Tensor))
     return {storage._cdata: storage for storage in (it.untyped_storage() for it in tensors)}

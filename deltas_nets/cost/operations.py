@@ -49,7 +49,7 @@ class OperationCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self.stage = stage
 
     def total(self) -> Flops:
-        """Of all stages together."""
+        """The sum over all stages."""
         found = self.flops.values()
         return Flops(sum(flops.products for flops in found), sum(flops.every for flops in found))
 
@@ -74,7 +74,7 @@ class OperationCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 def _counts_of(func: Any) -> Callable[..., Flops] | None:
-    """From an operator's arguments, keyword arguments and result to both counts, if known."""
+    """What makes both counts of an operator's arguments, keyword arguments and result, if known."""
     namespace, name = func._schema.name.split("::")
     if name == "_scaled_dot_product_flash_attention_for_cpu":
         return _fused_attention(lambda args, kwargs, out: attention_products(*args[:3]))

@@ -8,7 +8,9 @@ Sources: Zhao et al., ALIKED (2023); Tyszkiewicz, Fua and Trulls, DISK (2020); P
 XFeat (2024).
 """
 
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -84,16 +86,12 @@ def load_aliked(file: Path) -> AlikedScores:
     Raises:
         UserError: the file cannot be read, or a weight is missing; names the first one.
     """
-    try:
-        from kornia.feature import ALIKED
-    except ImportError:
-        raise _too_old("ALIKED") from None
     state = read_state(file)
     stem, aggregate = state.get("block1.conv1.weight"), state.get("desc_head.agg_weights")
     name = ALIKED_BY_STEM.get(16 if stem is None else len(stem), "aliked-n16")
     if aggregate is not None and len(aggregate) == 32:
         name = "aliked-n32"
-    network = ALIKED(model_name=name)
+    network = _of_kornia("ALIKED")(model_name=name)
     fill(network, state, file, what="ALIKED", computed=("dkd.hw_grid",))
     return AlikedScores(network).eval().requires_grad_(False)
 
@@ -104,9 +102,7 @@ def load_disk(file: Path) -> DiskScores:
     Raises:
         UserError: the file cannot be read, or a weight is missing; names the first one.
     """
-    from kornia.feature import DISK
-
-    network = DISK()
+    network = _of_kornia("DISK")()
     fill(network, read_state(file), file, what="DISK")
     return DiskScores(network).eval().requires_grad_(False)
 
@@ -117,14 +113,18 @@ def load_xfeat(file: Path) -> XfeatScores:
     Raises:
         UserError: the file cannot be read, or a weight is missing; names the first one.
     """
-    try:
-        from kornia.feature import XFeatModel
-    except ImportError:
-        raise _too_old("XFeat") from None
-    network = XFeatModel()
+    network = _of_kornia("XFeatModel")()
     fill(network, read_state(file), file, what="XFeat")
     return XfeatScores(network).eval().requires_grad_(False)
 
 
-def _too_old(name: str) -> UserError:
-    return UserError(f"this kornia has no {name}", "kornia", 'pip install "kornia>=0.9"')
+def _of_kornia(name: str) -> Any:
+    """A class of kornia's.
+
+    Raises:
+        UserError: it is of a later version than the one that is installed.
+    """
+    found = getattr(import_module("kornia.feature"), name, None)
+    if found is None:
+        raise UserError(f"this kornia has no {name}", "kornia", 'pip install "kornia>=0.9"')
+    return found

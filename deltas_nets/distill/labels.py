@@ -1,4 +1,4 @@
-"""From a teacher's score map to targets of the 65 channels of every 8 x 8 cell.
+"""A teacher's score map becomes targets of the 65 channels of every 8 x 8 cell.
 
 The layout is that of :func:`deltas_nets.losses.targets.detector_labels` and of the detector's
 logits: channel 8 y + x is pixel (x, y) of the cell, channel 64 is "none".

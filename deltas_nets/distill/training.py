@@ -182,7 +182,7 @@ def check_learned(learned: Learned, config: DistillConfig) -> None:
 
 
 def _features(encoder: LiteEncoder, batch: Lessons) -> Features:
-    """As of one view each; the maps at 1/2 and 1/4 that no detector reads are left empty."""
+    """Features of one view each; the maps at 1/2 and 1/4, which no detector reads, are empty."""
     unread = batch.eighth.new_empty(len(batch.eighth), 1, 0, 0, 0)
     with torch.no_grad():
         fine = encoder.fine(batch.images / 255)  # large to keep, and one layer to compute

@@ -53,7 +53,7 @@ class Decile(NamedTuple):
 
     @property
     def laplace_ratio(self) -> float:
-        """The same of the mean absolute error."""
+        """Likewise from the mean absolute error."""
         return self.laplace / self.std
 
 
@@ -83,7 +83,7 @@ class Sparsification(NamedTuple):
 
     @property
     def pooled_ratio(self) -> float:
-        """The same of all maps' pixels together."""
+        """The ratio of all maps' pixels together."""
         return self.pooled_half / self.pooled_every if self.pooled_every > 0 else float("nan")
 
 
@@ -194,7 +194,7 @@ class CalibrationMeter:
 
 
 class Groups(NamedTuple):
-    """As :class:`Decile`, for any number of groups: arrays ``(number,)``.
+    """What a :class:`Decile` says, for any number of groups: arrays ``(number,)``.
 
     Attributes:
         std: mean predicted relative standard deviation.

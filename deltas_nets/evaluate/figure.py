@@ -70,7 +70,7 @@ def draw_prediction(
 def _draw_matches(
     anchor: Axes, source: Axes, result: FrameDepth, depth_range: tuple[float, float]
 ) -> None:
-    """The same colours for a keypoint, its segment in the source and its match there."""
+    """A keypoint, its segment in the source and its match there have the same colour."""
     prediction, images = result.prediction, result.images.permute(0, 2, 3, 1).numpy()
     keypoints = prediction.keypoints.pixels.cpu()
     order = prediction.evidence.confidence.cpu().argsort(descending=True)

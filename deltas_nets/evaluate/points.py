@@ -27,7 +27,7 @@ def score_points(
 def score_keypoints(
     keypoints: KeypointDepths, truth: NDArray[np.float32], depth_range: tuple[float, float]
 ) -> DepthMetrics | None:
-    """The same of points whose network need not be one of deltas."""
+    """Metrics of points of any network; arguments as for :func:`score_points`."""
     predicted, true = _depths(keypoints, truth)
     return depth_metrics(predicted, true, depth_range=depth_range)
 

@@ -170,7 +170,7 @@ def _seen_by_other(
 
 
 def _distances(projected: Tensor, found: Tensor) -> Tensor:
-    """From each projection to each found point, ``(n, m)`` px."""
+    """How far each projection is from each found point, ``(n, m)`` px."""
     return torch.cdist(projected, found, compute_mode="donot_use_mm_for_euclid_dist")
 
 

@@ -115,7 +115,7 @@ def trace(model: Deltas, config: ExportConfig) -> ExportedProgram:
 
 
 def without_paths(program: ExportedProgram) -> ExportedProgram:
-    """The same program, changed in place, that does not tell where our source files were."""
+    """Remove from a program, in place, where our source files were."""
     for node in _nodes(program):
         node.meta.pop("stack_trace", None)
     return program

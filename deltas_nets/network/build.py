@@ -1,4 +1,4 @@
-"""From a config to the stages of a network."""
+"""This builds the stages of a network from its config."""
 
 from typing import NamedTuple
 

@@ -99,7 +99,7 @@ class Deltas(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights: what images are cast to, and cameras too, but to float32 at least."""
+        """The dtype of the weights: images are cast to it, and cameras, but to float32 at least."""
         return next(self.parameters()).dtype
 
     @property
@@ -212,8 +212,8 @@ class Deltas(nn.Module):
             )
             matches, posterior, confidence = matched.matches, matched.posterior, matched.confidence
             points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
-            if self.judge is not None and matched.decision is not None:
-                confidence = self.judge(matched.decision, matches, posterior, points, views)
+            if self.judge is not None and matched.chosen is not None:
+                confidence = self.judge(matched.chosen, matches, posterior, points, views)
             # A point may leave the range that was searched, as matches move afterwards; not by far.
             points = points.within_depth((0.5 * depth_range[0], 2 * depth_range[1]))
             sparse = rasterize_depth(

@@ -44,7 +44,7 @@ class Features(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """Of each map of :class:`Features`; the later stages are built for them."""
+    """How many channels each map of :class:`Features` has; the later stages are built for them."""
 
     fine: int
     half: int

@@ -23,16 +23,16 @@ class Posterior(NamedTuple):
     mask: Tensor
 
 
-class Decision(NamedTuple):
-    """How the joint matcher decided, for whoever judges it by what comes of it.
+class Chosen(NamedTuple):
+    """The depth that the joint matcher chose, and why; the judge looks at what comes of it.
 
     Attributes:
-        inv_depth: ``(B, N)`` decided, 1/m.
+        inv_depth: ``(B, N)`` chosen, 1/m.
         logit: ``(B, N)`` of the confidence where a source can see the point at some depth.
         seen: ``(B, N)`` bool, whether one can.
         evidence: ``(B, N, 4)`` what the logit rests on.
         embedding: ``(B, N, 64)`` of the points among each other.
-        moved: ``(B, V-1, N)`` how far each source moved its match after the decision, px.
+        moved: ``(B, V-1, N)`` how far each source moved its match after that, px.
     """
 
     inv_depth: Tensor
@@ -50,10 +50,10 @@ class Matched(NamedTuple):
         matches: of all views, ready to triangulate.
         confidence: ``(B, N)`` probability that the depth is right.
         posterior: where it comes from.
-        decision: of the joint matcher; None where each view decides alone.
+        chosen: of the joint matcher; None where each view decides alone.
     """
 
     matches: Matches
     confidence: Tensor
     posterior: Posterior
-    decision: Decision | None
+    chosen: Chosen | None

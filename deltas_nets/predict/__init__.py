@@ -1,1 +1,1 @@
-"""From frames to depth maps, by any network."""
+"""Any network makes depth maps of posed frames."""

@@ -1,4 +1,4 @@
-"""From a capture to a folder of depth maps."""
+"""A capture becomes a folder of depth maps."""
 
 import time
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""From posed frames to a depth map, by a network of deltas."""
+"""A network of deltas makes a depth map of posed frames."""
 
 from collections.abc import Sequence
 from pathlib import Path

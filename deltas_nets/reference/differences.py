@@ -216,7 +216,7 @@ DIFFERENCES = (
         "Training",
         "five losses",
         "not published",
-        "written from the paper; terms and weights are in `deltas_nets.losses.losses`",
+        "written from the paper; the terms and both weights are in `deltas_nets.config.losses`",
     ),
     Difference(
         27,

@@ -47,7 +47,7 @@ class ReferenceNetwork(nn.Module):
     """
 
     side_multiple = CELL
-    """Of images, in height and width."""
+    """Height and width of images are multiples of it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -248,7 +248,7 @@ class ReferenceNetwork(nn.Module):
     def forward(
         self, images: Tensor, views: PosedViews, *, num_keypoints: int = 512
     ) -> ReferencePrediction:
-        """As :meth:`predict`, called as networks of deltas are; random points are always the same.
+        """Do as :meth:`predict`, called as networks of deltas are; random points never change.
 
         Args:
             images: as for :meth:`predict`.

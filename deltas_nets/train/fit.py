@@ -123,7 +123,7 @@ def fit(
 
 
 def _silently(message: str) -> None:
-    """For processes that are not the first."""
+    """Processes that are not the first report nothing."""
 
 
 def _log(

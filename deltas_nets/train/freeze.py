@@ -6,6 +6,6 @@ from deltas_nets.config import TrainConfig
 
 
 def frozen_stages(model: nn.Module, config: TrainConfig) -> list[nn.Module]:
-    """Those that the config names and the network has."""
+    """The stages that the config names and the network has."""
     stages = (getattr(model, name, None) for name in config.freeze)
     return [stage for stage in stages if stage is not None]

@@ -27,7 +27,7 @@ class RunLog:
         """Nothing is open."""
 
     def progress(self, step: int) -> None:
-        """So many steps are done."""
+        """Show that so many steps are done."""
 
     def losses(
         self, step: int, losses: Mapping[str, float], *, rate: float, seconds: float

@@ -33,7 +33,7 @@ class Beginning(NamedTuple):
     teacher: Path | None
 
     def record(self) -> dict[str, object]:
-        """As it is written: of files what is in them, not where they are."""
+        """What is written about it: of files what is in them, not where they are."""
         return {
             "recipe": self.name,
             "effort": self.effort,

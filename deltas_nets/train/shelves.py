@@ -14,7 +14,7 @@ from deltas_nets.captures.posed_images import PosedImages
 
 
 def places_with_new_rooms(step: int, places: range, replay: int) -> list[int]:
-    """Those of a step's places that get a new room, each once in ``replay`` steps."""
+    """The places of a step that get a new room; each does once in ``replay`` steps."""
     return [place for place in places if (step + place) % replay == 0]
 
 
@@ -36,7 +36,7 @@ class Shelves:
         self._rooms: PosedImages | None = None
 
     def first_step(self, step: int) -> int:
-        """From where new rooms have to be put for the shelves to be as they are at ``step``.
+        """The step from which new rooms have to be put for the shelves to be as at ``step``.
 
         Negative before there is a whole shelf's worth of steps: step 0 finds one room on each.
         """

@@ -164,9 +164,9 @@ def test_a_peak_between_the_centres_of_a_wide_baseline_is_found() -> None:
     descriptors, keypoints = wall(round(disparity * scale), views=views)
     found = {}
     for most in (1, 8):
-        decision = matched(matcher_of(most), views, descriptors, keypoints).decision
-        assert decision is not None
-        found[most] = ((decision.inv_depth - inv_depth).abs() < SPACING / 3).float().mean()
+        chosen = matched(matcher_of(most), views, descriptors, keypoints).chosen
+        assert chosen is not None
+        found[most] = ((chosen.inv_depth - inv_depth).abs() < SPACING / 3).float().mean()
     assert found[8] > 0.95
     assert found[1] < 0.7
 

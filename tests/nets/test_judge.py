@@ -13,7 +13,7 @@ from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import CONFIGS, DetectorConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.joint.judge import Judge, of_posterior, of_refinement, of_triangulation
-from deltas_nets.network.records import Decision, Matched, Posterior
+from deltas_nets.network.records import Chosen, Matched, Posterior
 from deltas_nets.rooms import render_room
 
 SIZE = (64, 96)
@@ -22,7 +22,7 @@ SIZE = (64, 96)
 class Case(NamedTuple):
     """What a judge judges by."""
 
-    decision: Decision
+    chosen: Chosen
     matches: Matches
     posterior: Posterior
     points: Triangulation
@@ -50,8 +50,8 @@ def case_of(model: Deltas, room: PosedImages) -> Case:
     )
     matches = found.matches
     points = triangulate(views.proj, matches.pixels, matches.weights, matches.mask)
-    assert found.decision is not None
-    return Case(found.decision, matches, found.posterior, points, views)
+    assert found.chosen is not None
+    return Case(found.chosen, matches, found.posterior, points, views)
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +71,8 @@ def taught() -> Judge:
 def clues_of(case: Case) -> Tensor:
     return torch.cat(
         [
-            of_triangulation(case.decision, case.matches, case.points, case.views),
-            of_refinement(case.decision, case.matches),
+            of_triangulation(case.chosen, case.matches, case.points, case.views),
+            of_refinement(case.chosen, case.matches),
             of_posterior(case.posterior, window=2),
         ],
         dim=-1,
@@ -83,7 +83,7 @@ def test_it_starts_with_no_correction(model: Deltas, room: PosedImages, case: Ca
     with torch.no_grad():
         confidence = Judge(window=2)(*case)
         prediction = model(room.images.float() / 255, room.views)
-    before = torch.where(case.decision.seen, case.decision.logit.sigmoid(), 0.0)
+    before = torch.where(case.chosen.seen, case.chosen.logit.sigmoid(), 0.0)
     assert torch.equal(confidence, before)
     torch.testing.assert_close(prediction.evidence.confidence, before[0], rtol=0, atol=1e-6)
 
@@ -105,7 +105,7 @@ def test_a_correction_changes_confidence_alone(
 def test_the_order_of_sources_changes_nothing(case: Case) -> None:
     judge, order = taught(), [0, 3, 1, 2]
     turned = case._replace(
-        decision=case.decision._replace(moved=case.decision.moved[:, [2, 0, 1]]),
+        chosen=case.chosen._replace(moved=case.chosen.moved[:, [2, 0, 1]]),
         matches=Matches(*(each[:, order] for each in case.matches)),
         views=PosedViews(*(each[:, order] for each in case.views)),
     )
@@ -132,25 +132,25 @@ def test_clues_are_bounded_whatever_happens(
         covariance=torch.full_like(case.matches.covariance, size),
         mask=torch.full_like(case.matches.mask, seen),
     )
-    decision = case.decision._replace(
-        inv_depth=torch.full_like(case.decision.inv_depth, other),
-        moved=torch.full_like(case.decision.moved, size),
+    chosen = case.chosen._replace(
+        inv_depth=torch.full_like(case.chosen.inv_depth, other),
+        moved=torch.full_like(case.chosen.moved, size),
     )
     stages = tuple(size * stage.sign() for stage in case.posterior.stages)
     posterior = case.posterior._replace(stages=stages)
-    clues = clues_of(Case(decision, matches, posterior, points, case.views))
+    clues = clues_of(Case(chosen, matches, posterior, points, case.views))
     assert clues.isfinite().all()
     assert (clues.abs() <= 10).all()
 
 
 def test_points_that_no_source_sees_have_no_confidence(case: Case) -> None:
-    nowhere = torch.zeros_like(case.decision.seen)
+    nowhere = torch.zeros_like(case.chosen.seen)
     matches = case.matches._replace(mask=torch.zeros_like(case.matches.mask))
     points = triangulate(case.views.proj, matches.pixels, matches.weights, matches.mask)
-    decision = case.decision._replace(seen=nowhere)
-    decision.embedding.requires_grad_()
+    chosen = case.chosen._replace(seen=nowhere)
+    chosen.embedding.requires_grad_()
     judge = taught()
-    confidence = judge(decision, matches, case.posterior, points, case.views)
+    confidence = judge(chosen, matches, case.posterior, points, case.views)
     assert (confidence == 0).all()
     confidence.sum().backward()
     gradients = [parameter.grad for parameter in judge.parameters()]
@@ -159,9 +159,9 @@ def test_points_that_no_source_sees_have_no_confidence(case: Case) -> None:
 
 def test_no_gradient_passes_through_clues_to_descriptors(model: Deltas, room: PosedImages) -> None:
     case = case_of(model, room)
-    assert case.points.residual.requires_grad and case.decision.evidence.requires_grad
-    cut = case.decision._replace(
-        logit=case.decision.logit.detach(), embedding=case.decision.embedding.detach()
+    assert case.points.residual.requires_grad and case.chosen.evidence.requires_grad
+    cut = case.chosen._replace(
+        logit=case.chosen.logit.detach(), embedding=case.chosen.embedding.detach()
     )
     judge = taught()
     confidence = judge(cut, *case[1:])
@@ -174,7 +174,7 @@ def test_no_gradient_passes_through_clues_to_descriptors(model: Deltas, room: Po
 
 def test_the_embedding_learns_to_tell_about_confidence(model: Deltas, room: PosedImages) -> None:
     case = case_of(model, room)
-    embedding, logit = case.decision.embedding, case.decision.logit
+    embedding, logit = case.chosen.embedding, case.chosen.logit
     confidence = taught()(*case)
     gradients = torch.autograd.grad(confidence.square().sum(), [embedding, logit])
     assert all(gradient.abs().max() > 0 for gradient in gradients)
@@ -182,13 +182,13 @@ def test_the_embedding_learns_to_tell_about_confidence(model: Deltas, room: Pose
 
 def test_rays_that_meet_where_it_was_decided_are_as_expected(case: Case) -> None:
     decided = torch.where(case.points.valid, 1 / case.points.depth[:, 0].clamp_min(1e-3), 1.0)
-    decision = case.decision._replace(inv_depth=decided)
-    clues = of_triangulation(decision, case.matches, case.points, case.views)
+    chosen = case.chosen._replace(inv_depth=decided)
+    clues = of_triangulation(chosen, case.matches, case.points, case.views)
     assert case.points.valid.any()
     assert (clues[..., 3][case.points.valid] < 1e-4).all()
     torch.testing.assert_close(clues[..., 4], case.points.valid.float())
     twice = of_triangulation(
-        decision._replace(inv_depth=2 * decided), case.matches, case.points, case.views
+        chosen._replace(inv_depth=2 * decided), case.matches, case.points, case.views
     )
     expected = torch.full_like(twice[..., 3], 2).log()[case.points.valid]
     torch.testing.assert_close(twice[..., 3][case.points.valid], expected, rtol=1e-4, atol=1e-4)
@@ -201,7 +201,7 @@ def test_the_parallax_is_that_of_the_widest_source(case: Case) -> None:
     alone = triangulate(case.views.proj, one.pixels, one.weights, one.mask)
     valid = alone.valid & (alone.parallax > 2e-3) & (alone.parallax < 0.2)
     assert valid.sum() > 10
-    clues = of_triangulation(case.decision, one, alone, case.views)
+    clues = of_triangulation(case.chosen, one, alone, case.views)
     torch.testing.assert_close(
         clues[..., 1][valid], alone.parallax.log10()[valid] + 1, rtol=0, atol=2e-3
     )

@@ -13,7 +13,7 @@ from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_nets.network.joint.context import WIDTH
 from deltas_nets.network.joint.parallax import parallax_of, relative_error_per_pixel
 from deltas_nets.network.layers import WideLinear
-from deltas_nets.network.records import Decision, Posterior
+from deltas_nets.network.records import Chosen, Posterior
 
 NUM_CLUES = 14
 
@@ -35,7 +35,7 @@ class Judge(nn.Module):
 
     def forward(
         self,
-        decision: Decision,
+        chosen: Chosen,
         matches: Matches,
         posterior: Posterior,
         points: Triangulation,
@@ -44,7 +44,7 @@ class Judge(nn.Module):
         """Confidence ``(B, N)``, 0 where no source can see the point at any depth.
 
         Args:
-            decision: of the matcher.
+            chosen: of the matcher.
             matches: as they were triangulated, ``(B, V, N)``.
             posterior: of the matcher.
             points: triangulated from the matches.
@@ -52,22 +52,22 @@ class Judge(nn.Module):
         """
         clues = torch.cat(
             [
-                decision.evidence.detach(),
-                of_triangulation(decision, matches, points, views),
-                of_refinement(decision, matches),
+                chosen.evidence.detach(),
+                of_triangulation(chosen, matches, points, views),
+                of_refinement(chosen, matches),
                 of_posterior(posterior, window=self.window),
             ],
             dim=-1,
         )
         # The embedding alone may learn to tell more about confidence.
-        known = torch.cat([decision.embedding, clues], dim=-1)
-        logit = decision.logit + self.correction(known).squeeze(-1)
-        return torch.where(decision.seen, logit.sigmoid(), 0.0)
+        known = torch.cat([chosen.embedding, clues], dim=-1)
+        logit = chosen.logit + self.correction(known).squeeze(-1)
+        return torch.where(chosen.seen, logit.sigmoid(), 0.0)
 
 
 @torch.no_grad()
 def of_triangulation(
-    decision: Decision, matches: Matches, points: Triangulation, views: PosedViews
+    chosen: Chosen, matches: Matches, points: Triangulation, views: PosedViews
 ) -> Tensor:
     """Do the rays meet, at a good angle, where the matcher expected it? ``(B, N, 5)``, bounded.
 
@@ -80,7 +80,7 @@ def of_triangulation(
     deviation = _mean(variance, used, count).clamp(1e-2, 1e2).sqrt()
     parallax = parallax_of(views, points, used)
     relative = deviation * relative_error_per_pixel(views, parallax)
-    ratio = (points.depth[:, 0] * decision.inv_depth).clamp(0.1, 10.0)
+    ratio = (points.depth[:, 0] * chosen.inv_depth).clamp(0.1, 10.0)
     return torch.stack(
         [
             points.residual.clamp(1e-2, 1e2).log10(),
@@ -94,11 +94,11 @@ def of_triangulation(
 
 
 @torch.no_grad()
-def of_refinement(decision: Decision, matches: Matches) -> Tensor:
+def of_refinement(chosen: Chosen, matches: Matches) -> Tensor:
     """How far views moved their matches, do they trust them, how many? ``(B, N, 3)``, bounded."""
     used = matches.mask[:, 1:]
     count = used.sum(dim=1)
-    moved = _mean(decision.moved, used, count).clamp_max(10.0)  # px
+    moved = _mean(chosen.moved, used, count).clamp_max(10.0)  # px
     trust = _mean(matches.weights[:, 1:], used, count)
     return torch.stack([moved, trust, count.clamp_max(16) / 4], dim=-1)
 
@@ -121,5 +121,5 @@ def of_posterior(posterior: Posterior, *, window: int) -> Tensor:
 
 
 def _mean(values: Tensor, used: Tensor, count: Tensor) -> Tensor:
-    """Of the used views ``(B, V-1, N)``: ``(B, N)``, 0 where there is none."""
+    """The mean ``(B, N)`` of ``(B, V-1, N)`` over the used views; 0 where there is none."""
     return safe_divide(torch.where(used, values, 0.0).sum(dim=1), count, count > 0)

@@ -1,8 +1,8 @@
-"""From keypoints to matches: what a matcher returns, and the joint one.
+"""The joint matcher finds where the anchor's keypoints are in the other views.
 
 Matches go straight into triangulation, with the posterior they come from and one confidence per
-point. The joint matcher first finds the depth on which all views agree, then lets every view
-move its match a little towards what it sees. The paper's is in `per_view_matcher`.
+point. First the matcher finds the depth on which all views agree, then it lets every view move its
+match a little towards what it sees. The paper's is in `per_view_matcher`.
 """
 
 import torch
@@ -28,7 +28,7 @@ from deltas_nets.network.joint.inverse_depths import (
 from deltas_nets.network.joint.refine import RefineMatches
 from deltas_nets.network.layers import WideLinear
 from deltas_nets.network.lite.descriptor import WIDTH, Descriptors
-from deltas_nets.network.records import Decision, Matched, Posterior
+from deltas_nets.network.records import Chosen, Matched, Posterior
 
 
 class JointMatcher(nn.Module):
@@ -112,7 +112,7 @@ class JointMatcher(nn.Module):
                 centres,
                 (bins.share > 0).unsqueeze(1),
             ),
-            Decision(inv_depth, logit, somewhere, evidence, embedding, moved),
+            Chosen(inv_depth, logit, somewhere, evidence, embedding, moved),
         )
 
     def _fused(self, correlation: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,7 @@ RANGE = (-6.0, 2.0)
 
 
 class Curve(NamedTuple):
-    """From predicted to right log standard deviations.
+    """What predicted log standard deviations become, so that they are right.
 
     Attributes:
         knots: ``(8,)`` log of predicted relative standard deviations, increasing.
@@ -101,7 +101,7 @@ class SpreadCalibration(nn.Module):
         values.copy_(curve.values)
 
     def reset(self) -> None:
-        """Back to the identity: the spread as the network predicts it."""
+        """Make it the identity: the spread stays as the network predicts it."""
         self.knots.copy_(_identity())
         self.values.copy_(_identity())
 

@@ -57,7 +57,7 @@ def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:
 
 
 class ConvexUpsampling(nn.Module):
-    """From features to the logits of :func:`convex_upsample`; untrained, those of bilinear."""
+    """Makes the logits of :func:`convex_upsample`; untrained, it makes those of bilinear."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

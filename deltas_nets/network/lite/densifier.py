@@ -1,4 +1,4 @@
-"""From sparse depth to a dense map with its own uncertainty.
+"""The densifier makes a dense map, with its own uncertainty, of sparse depth.
 
 The sparse depth is interpolated without parameters (pull-push), and a small U-Net on the
 anchor's features corrects it at four scales; the finest of them, at half resolution, is upsampled

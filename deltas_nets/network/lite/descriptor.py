@@ -68,6 +68,6 @@ class Descriptor(nn.Module):
         )
 
     def _taps(self, maps: Features | Channels) -> tuple[Any, ...]:
-        """Of the pyramid, fine to coarse."""
+        """The maps that the pyramid reads, fine to coarse."""
         coarser = (maps.quarter, maps.eighth, maps.sixteenth)
         return (maps.half, *coarser) if self.stride == 2 else coarser

@@ -41,7 +41,7 @@ class ViewTaps(NamedTuple):
     image_size: tuple[int, int]
 
     def of_anchor(self) -> Taps:
-        """Those of view 0, ``(B, C, h, w)``."""
+        """The taps of view 0, ``(B, C, h, w)``."""
         return Taps(*(tap[:: self.num_views] for tap in self.taps))
 
     def each(self) -> list["ViewTaps"]:

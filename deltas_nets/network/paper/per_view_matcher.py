@@ -120,7 +120,7 @@ def _dot_products(
     *,
     image_size: tuple[int, int],
 ) -> Tensor:
-    """Of descriptors ``(B, N, D)`` and features ``(B, D, h, w)`` at ``(B, N, O, S, 2)``."""
+    """Multiply descriptors ``(B, N, D)`` with features ``(B, D, h, w)`` at ``(B, N, O, S, 2)``."""
     read = sample_map(features, pixels.flatten(1, 3), image_size=image_size)
     descriptors, read = promoted(descriptors, read.reshape(*mask.shape, read.shape[-1]))
     return torch.where(mask, torch.einsum("bnd,bnosd->bnos", descriptors, read), 0.0)
