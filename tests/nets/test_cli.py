@@ -167,13 +167,17 @@ def test_shards_share_the_work(depth: DepthCommand) -> None:
     assert len(list((depth.out / "depth").iterdir())) == 4
 
 
-def test_another_scale_is_known_to_who_reads_the_maps(depth: DepthCommand) -> None:
-    assert depth("--depth-scale", 100).code == 0
-    scored = depth.run("evaluate", depth.capture, "--predictions", depth.out)
-    assert_one_line(depth(), "depth_scale was 100.0, is null")
-    assert depth("--overwrite").code == 0
-    fine = depth.run("evaluate", depth.capture, "--predictions", depth.out)
-    assert scored.out.splitlines()[1:5] == fine.out.splitlines()[1:5]
+def test_another_scale_is_known_to_who_reads_the_maps(depth: DepthCommand, tmp_path: Path) -> None:
+    errors = []
+    for scale in (100, 1000):
+        assert depth("--depth-scale", scale, "--overwrite").code == 0
+        score = ["--predictions", depth.out, "--json", tmp_path / "s.json"]
+        assert depth.run("evaluate", depth.capture, *score).code == 0
+        scores = json.loads((tmp_path / "s.json").read_text())
+        errors.append(scores["metrics"]["dense"]["abs_rel"])
+    assert errors[0] == pytest.approx(errors[1], abs=0.002)  # half a centimetre at 2.5 m
+    assert "depth_scale" not in depth.summary()["settings"]  # as before there was another scale
+    assert_one_line(depth("--depth-scale", 100), "depth_scale was null, is 100.0")
 
 
 def test_depth_beyond_the_file_is_a_warning(
