@@ -124,6 +124,11 @@ class Frames(Mapping[str, Frame]):
         sizes = np.array([camera.image_size for camera in self.arrays.cameras], dtype=np.int64)
         return sizes.reshape(-1, 2)[self.arrays.camera_of]
 
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """``(F,)`` the ids, of a format whose ids are numbers."""
+        return self.arrays.ids.astype(np.int64)
+
     def id_at(self, position: int) -> str:
         """The id of the frame at a position."""
         return str(self.arrays.ids[position].decode())

@@ -16,7 +16,7 @@ from deltas_nets.captures.work_size import depth_at_image, load_views
 from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.datasets.scene_cache import read_scene_cached
 from deltas_nets.datasets.scene_names import choose_scenes
-from deltas_nets.datasets.scenes import LeftOut, frame_numbers, left_out, skipped
+from deltas_nets.datasets.scenes import LeftOut, left_out, skipped
 from deltas_nets.datasets.skip_list import SkipList, read_skip_list
 from deltas_nets.datasets.view_rules import ByBaseline, ByGap, ViewRule
 from deltas_nets.errors import UserError
@@ -118,7 +118,7 @@ def open_scannet(
         for name, path in folders.items():
             if name not in skip.whole:
                 scene = read_scene_cached(path, cache)
-                scenes[name] = skipped(scene, skip.listed(name, frame_numbers(scene.frames)))
+                scenes[name] = skipped(scene, skip.listed(name, scene.frames.numbers))
     except OSError as error:
         what = f"the scenes cannot be read ({error.strerror or error})"
         raise UserError(what, error.filename or root, "check it, and its permissions") from error

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.readers import scannet
 from deltas_nets.errors import UserError
 
-__all__ = ["LeftOut", "frame_numbers", "left_out", "read_scene", "skipped"]
+__all__ = ["LeftOut", "left_out", "read_scene", "skipped"]
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,3 @@ def skipped(scene: Capture, listed: NDArray[np.bool_]) -> Capture:
     """The scene less the frames ``(F,)`` that a skip list names."""
     why = UserError("the frame is in the skip list", scene.path, "take it out of --data.skip")
     return scene.without(listed, Lost("listed", why))
-
-
-def frame_numbers(frames: Frames) -> NDArray[np.int64]:
-    """``(F,)`` the ids of frames in ScanNet's layout, which are numbers."""
-    return frames.arrays.ids.astype(np.int64)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.view_choice import spread_sources
-from deltas_nets.datasets.scenes import frame_numbers
 
 __all__ = ["ByBaseline", "ByGap", "ViewRule"]
 
@@ -54,7 +53,7 @@ class ByGap(NamedTuple):
 
     def anchors(self, frames: Frames) -> NDArray[np.intp]:
         """Frames whose sources are all usable."""
-        numbers = frame_numbers(frames)
+        numbers = frames.numbers
         complete = np.ones(len(numbers), dtype=bool)
         for offset in self.offsets():
             complete &= np.isin(numbers + offset, numbers, assume_unique=True)
@@ -62,7 +61,7 @@ class ByGap(NamedTuple):
 
     def sources(self, frames: Frames, anchor: int) -> list[int]:
         """Positions of the sources, nearest first, the earlier one of two."""
-        numbers = frame_numbers(frames)
+        numbers = frames.numbers
         wanted = numbers[anchor] + np.array(self.offsets())
         return [int(position) for position in np.searchsorted(numbers, wanted)]
 
