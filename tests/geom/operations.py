@@ -73,7 +73,8 @@ def at_depths(K: Tensor, poses: Tensor, keypoints: Tensor, inv_depths: Tensor) -
 
 
 def samples_at(places: Tensor, mask: Tensor) -> geom.Samples:
-    masks = mask[..., 1:, :, None, None].expand(places.shape[:-1])
+    masks = mask[..., 1:, :, None, None]
+    masks = masks.expand(torch.broadcast_shapes(masks.shape, places.shape[:-1]))
     return geom.Samples(places, places[..., 0, :, 0], masks)
 
 

@@ -74,17 +74,6 @@ def test_wrong_arguments_are_named(function: Correlation) -> None:
 
 
 @BOTH
-def test_batch_dims_broadcast(function: Correlation, dtype: torch.dtype) -> None:
-    descriptors = torch.rand(2, 3, 6, dtype=dtype)
-    features = torch.rand(4, 1, 2, 6, 6, 8, dtype=dtype)
-    pixels = 32 * torch.rand(2, 3, 7, 2, dtype=dtype)
-    scores = function(descriptors, features, samples_at(pixels), image_size=SIZE)
-    assert scores.shape == (4, 2, 2, 3, 1, 7) and scores.dtype == dtype
-    alone = function(descriptors[1], features[3, 0], samples_at(pixels), image_size=SIZE)
-    assert_close(scores[3, 1], alone)
-
-
-@BOTH
 def test_nothing_to_correlate_is_no_error(function: Correlation) -> None:
     for batch, views, count in ((2, 1, 0), (0, 1, 3), (2, 0, 3)):
         descriptors = torch.zeros(batch, count, 3, requires_grad=True)

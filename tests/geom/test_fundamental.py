@@ -42,14 +42,6 @@ def test_wrong_shapes_are_named() -> None:
         epipolar_distance(torch.zeros(3, 3), torch.zeros(3, 5, 2), torch.zeros(2, 5, 2))
 
 
-def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
-    scene = forward_motion(dtype=dtype)
-    fundamental = fundamental_between(scene.views)
-    lines = epipolar_lines(fundamental, scene.pixels[0].expand(4, 1, 3, 2))
-    assert lines.shape == (4, 1, 3, 3) and lines.dtype == dtype
-    assert_close(lines[3, 0], epipolar_lines(fundamental, scene.pixels[0]))
-
-
 @given(scene=posed_scenes())
 @pytest.mark.parametrize("name", EXACT)
 def test_lines_are_exact(name: str, scene: PosedScene) -> None:

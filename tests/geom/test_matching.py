@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import (
-    Samples,
     ShapeError,
     epipolar_segments,
     match_joint,
@@ -45,25 +44,6 @@ def test_wrong_covariances_and_floors_are_named() -> None:
     for floor in (0.0, -1.0, torch.nan):
         with pytest.raises(ValueError, match="floor must be positive"):
             weights_from_covariance(torch.zeros(4, 2, 2), floor=floor)
-
-
-def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
-    scene = forward_motion(dtype=dtype)
-    samples = sample_inv_depths(
-        scene.views, scene.pixels[0], INV_DEPTHS.to(dtype), image_size=IMAGE_SIZE
-    )
-    scores = torch.rand(4, 2, 1, 3, 1, 31, dtype=dtype)
-    matches = match_joint(scene.views, scene.pixels[0], scores, samples, image_size=IMAGE_SIZE)
-    assert matches.pixels.shape == (4, 2, 2, 3, 2) and matches.weights.shape == (4, 2, 2, 3)
-    matches = match_per_view(scene.pixels[0], scores, samples, window=3)
-    assert matches.pixels.shape == (4, 2, 2, 3, 2)
-    assert matches.covariance.shape == (4, 2, 2, 3, 2, 2)
-
-
-def test_no_keypoints_are_no_error() -> None:
-    places = torch.zeros(1, 0, 1, 1, 2)
-    samples = Samples(places, places[..., 0, 0], places[..., 0].bool())
-    assert match_per_view(torch.zeros(0, 2), places[..., 0], samples).pixels.shape == (2, 0, 2)
 
 
 @given(positions=vectors(7, within=100.0, size=2), place=st.integers(0, 6))

@@ -51,19 +51,6 @@ def test_batch_dims_that_do_not_broadcast_are_named() -> None:
         pixel_rays(three.K[:, 0], torch.zeros(2, 5, 2))
 
 
-def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
-    scene = forward_motion(dtype=dtype)
-    seen = project(scene.views, scene.points.expand(4, 1, 3, 3))
-    assert seen.pixels.shape == (4, 1, 2, 3, 2) and seen.pixels.dtype == dtype
-    assert_close(seen.pixels[2, 0], scene.pixels)
-    back = unproject(scene.views, seen.pixels, seen.depth)
-    assert_close(back[1, 0, 1], scene.points, rtol=0, atol=1e-5)  # m
-
-
-def test_no_points_are_no_error() -> None:
-    assert project(forward_motion().views, torch.zeros(0, 3).double()).pixels.shape == (2, 0, 2)
-
-
 @given(scene=posed_scenes(num_views=3))
 def test_unprojection_undoes_projection(scene: PosedScene) -> None:
     seen = project(scene.views, scene.points)

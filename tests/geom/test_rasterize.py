@@ -114,23 +114,6 @@ def test_vmap_is_a_batch_dim_and_traced_as_one_graph_it_is_the_same(kind: tuple[
     torch.compiler.reset()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_batch_dims_broadcast(kind: tuple[str, str], dtype: torch.dtype) -> None:
-    pixels = torch.rand(4, 1, 7, 2, dtype=dtype) * 3
-    depth = 1 + torch.rand(3, 7, dtype=dtype)
-    sparse = rasterize((pixels, depth, torch.ones(7, dtype=dtype)), kind)
-    assert sparse.depth.shape == sparse.weight.shape == (4, 3, 1, 4, 5)
-    assert sparse.depth.dtype == dtype
-    alone = rasterize((pixels[2, 0], depth[1], torch.ones(7, dtype=dtype)), kind)
-    assert_close(sparse.depth[2, 1], alone.depth)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_no_points_are_an_empty_image(kind: tuple[str, str]) -> None:
-    sparse = rasterize((torch.zeros(0, 2), torch.zeros(0), torch.zeros(0)), kind)
-    assert sparse.depth.shape == (1, 4, 5) and (sparse.depth == 0).all()
-
-
 @given(scene=depth_scenes())
 @pytest.mark.parametrize("name", DRAWN)
 def test_each_way_of_drawing_is_right(name: str, scene: DepthScene) -> None:

@@ -54,31 +54,6 @@ def test_wrong_arguments_are_named() -> None:
         sample_inv_depths(scene.views, scene.pixels[0], torch.tensor(1.0), image_size=(4, 4))
 
 
-def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
-    scene = forward_motion(dtype=dtype)
-    keypoints = scene.pixels[0].expand(4, 1, 3, 2)
-    segments = epipolar_segments(
-        scene.views, keypoints, depth_range=(0.7, 20), image_size=IMAGE_SIZE
-    )
-    samples = sample_segments(segments, 5, offsets=(-1, 0, 1), image_size=IMAGE_SIZE)
-    assert samples.pixels.shape == (4, 1, 1, 3, 3, 5, 2) and samples.pixels.dtype == dtype
-    assert samples.inv_depth.shape == (4, 1, 1, 3, 5) and samples.mask.shape == (4, 1, 1, 3, 3, 5)
-    for inv_depths in (torch.rand(5, dtype=dtype), torch.rand(4, 1, 3, 5, dtype=dtype)):
-        common = sample_inv_depths(scene.views, keypoints, inv_depths, image_size=IMAGE_SIZE)
-        assert common.pixels.shape == (4, 1, 1, 3, 1, 5, 2)
-        assert common.inv_depth.shape == (4, 1, 1, 3, 5)
-    read = sample_map(torch.rand(4, 1, 7, 6, 8, dtype=dtype), keypoints, image_size=IMAGE_SIZE)
-    assert read.shape == (4, 1, 3, 7) and read.dtype == dtype
-
-
-def test_no_keypoints_are_no_error() -> None:
-    assert sample_map(torch.zeros(2, 7, 4, 4), torch.zeros(0, 2), image_size=(4, 4)).shape == (
-        2,
-        0,
-        7,
-    )
-
-
 @given(scene=posed_scenes(), count=st.integers(2, 9))
 @pytest.mark.parametrize("name", ALONG)
 def test_samples_run_evenly_over_what_is_visible(name: str, scene: PosedScene, count: int) -> None:

@@ -71,24 +71,6 @@ def test_wrong_arguments_are_named() -> None:
         epipolar_segments(views, torch.zeros(1, 2), depth_range=(2, 1), image_size=(4, 4))
 
 
-def test_batch_dims_broadcast(dtype: torch.dtype) -> None:
-    scene = forward_motion(dtype=dtype)
-    pixels = scene.pixels[0].expand(4, 1, 3, 2)
-    segments = epipolar_segments(scene.views, pixels, depth_range=(0.5, 10), image_size=IMAGE_SIZE)
-    assert segments.start.shape == (4, 1, 1, 3, 2) and segments.start.dtype == dtype
-    assert segments.status.shape == (4, 1, 1, 3) and segments.status.dtype == torch.int8
-
-
-def test_no_keypoints_are_no_error() -> None:
-    segments = epipolar_segments(
-        forward_motion().views,
-        torch.zeros(0, 2).double(),
-        depth_range=(1, 2),
-        image_size=IMAGE_SIZE,
-    )
-    assert segments.start.shape == (1, 0, 2)
-
-
 @given(scene=rigs(), depth_range=depth_ranges())
 @pytest.mark.parametrize("name", CLIPPED)
 def test_the_segment_is_what_is_visible(
@@ -325,20 +307,6 @@ def test_a_range_behind_the_source_is_empty_with_zero_gradient() -> None:
     total = sum(value.sum() for value in segments[:4])
     assert total.item() == 0  # type: ignore[union-attr]
     assert (torch.autograd.grad(total, pixels)[0] == 0).all()
-
-
-def test_a_keypoint_that_is_nan_spoils_no_gradient() -> None:
-    views = forward_motion().views
-    K = views.K.clone().requires_grad_()
-    pixels = torch.tensor([[torch.nan, 100.0], [100.0, 100.0]]).double().requires_grad_()
-    segments = epipolar_segments(
-        PosedViews(K, views.cam_from_world), pixels, depth_range=(1, 4), image_size=IMAGE_SIZE
-    )
-    assert segments.status[0].tolist() == [Status.NOT_FINITE_INPUT, Status.OK]
-    assert segments.visible[0].tolist() == [False, True]
-    assert (segments.start[0, 0] == 0).all() and segments.inv_depth_end[0, 0] == 0
-    for gradient in torch.autograd.grad(segments.start.sum() + segments.end.sum(), (pixels, K)):
-        assert gradient.isfinite().all()
 
 
 def test_an_anchor_alone_has_no_segments() -> None:

@@ -123,6 +123,39 @@ def test_what_is_not_finite_is_answered_finitely_and_alone(name: str, value: flo
                     assert ours[1].flatten()[place] == 0, where
 
 
+@pytest.mark.parametrize("view", [0, 1, 2])
+@pytest.mark.parametrize("field", ["K", "poses"])
+def test_a_camera_that_is_not_finite_sees_nothing_and_passes_nothing(field: str, view: int) -> None:
+    inputs = inputs_in(torch.float64)
+    bad = inputs[field].clone()
+    bad[view, 0, 1] = torch.nan
+    inputs = followed(inputs | {field: bad})
+    views = geom.PosedViews(inputs["K"], inputs["poses"])
+    sources = [view - 1] if view else [0, 1]
+    assert views.proj[view].isnan().all() and views.proj.isfinite().sum() == 24
+    seen, points = (
+        OPERATIONS[name](**chosen(OPERATIONS[name], inputs)) for name in ("project", "unproject")
+    )
+    assert not seen.in_front[view].any() and (seen.depth[view] == 0).all()
+    segments, samples = (
+        OPERATIONS[name](**chosen(OPERATIONS[name], inputs))
+        for name in ("epipolar_segments", "sample_inv_depths")
+    )
+    assert (segments.status[sources] == geom.Status.NOT_FINITE_INPUT).all()
+    assert not samples.mask[sources].any()
+    fundamental = geom.fundamental_between(views, view, (view + 1) % 3)
+    nothing = [
+        seen.pixels[view],
+        points[view],
+        segments.start[sources],
+        segments.end[sources],
+        samples.pixels[sources],
+        fundamental,
+    ]
+    assert all((each == 0).all() for each in nothing)
+    assert all((each == 0).all() for each in gradients_of(nothing, inputs))
+
+
 @EACH
 def test_integers_arrays_and_lists_are_refused_with_the_cure(name: str) -> None:
     operation, given = OPERATIONS[name], chosen(OPERATIONS[name], inputs_in(torch.float32))
@@ -168,6 +201,24 @@ def test_nothing_is_no_error(name: str, dtype: torch.dtype) -> None:
         assert all(each.isfinite().all() for each in results if is_real(each))
         assert all(each.dtype == dtype for each in results if is_real(each))
         assert all(each.isfinite().all() for each in gradients_of(results, inputs))
+
+
+@EACH
+def test_batch_dims_broadcast_and_vmap_is_one(name: str, dtype: torch.dtype) -> None:
+    operation, given = OPERATIONS[name], chosen(OPERATIONS[name], inputs_in(dtype))
+    plain = tensors_of(operation(**given))
+    near = 4096 * torch.finfo(dtype).eps
+    for batched in given if name != "pixel_grid" else ():
+        many = given | {batched: given[batched].expand(2, 1, *given[batched].shape)}
+        for ours, theirs in zip(tensors_of(operation(**many)), plain, strict=True):
+            assert ours.dtype == theirs.dtype
+            assert ours.shape in (theirs.shape, (2, 1, *theirs.shape))
+            assert_close(ours, theirs.expand_as(ours), rtol=near, atol=near * largest(theirs))
+    many = {key: each.expand(2, *each.shape) for key, each in given.items()}
+    mapped = torch.func.vmap(lambda one: tensors_of(operation(**one)))(many)
+    for ours, theirs in zip(mapped, plain, strict=True):
+        assert ours.dtype == theirs.dtype
+        assert_close(ours, theirs.expand(2, *theirs.shape), rtol=near, atol=near * largest(theirs))
 
 
 @EACH

@@ -107,24 +107,6 @@ def test_a_list_of_one_keeps_the_view_dim(index: Any) -> None:
     assert ring().views.select(index).proj.shape == (1, 3, 4)
 
 
-def test_a_cast_takes_what_a_tensors_cast_takes() -> None:
-    views = ring().views
-    for cast in (
-        views.to(dtype=torch.float32),
-        views.to("cpu", dtype=torch.float32, copy=True),
-        views.to("cpu", torch.float32, non_blocking=True),
-        views.to(torch.zeros(1)),
-    ):
-        assert isinstance(cast, PosedViews)
-        assert cast.K.dtype == cast.cam_from_world.dtype == torch.float32
-    assert views.to("meta").proj.device.type == "meta"
-
-
-def test_a_cast_casts_both(dtype: torch.dtype) -> None:
-    views = ring().views.to(dtype)
-    assert views.K.dtype == views.cam_from_world.dtype == dtype and views.num_views == 4
-
-
 def test_good_values_pass_and_bad_ones_say_why() -> None:
     views = forward_motion().views
     views.check_values()
