@@ -11,6 +11,7 @@ import skimage.data
 from numpy.typing import NDArray
 
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.images import ImageMemory
 from deltas_nets.errors import UserError
 
 FOCAL = 994.978  # px
@@ -62,8 +63,8 @@ def motorcycle() -> StereoPair:
     K_right[0, 2] -= DISPARITY_AT_INFINITY
     right_from_left = np.eye(4)
     right_from_left[0, 3] = -BASELINE
-    return StereoPair(
-        Frame("left", folder / "motorcycle_left.png", SIZE, K_left, np.eye(4)),
-        Frame("right", folder / "motorcycle_right.png", SIZE, K_right, right_from_left),
-        depth.astype(np.float32),
+    left, right = (
+        Frame(name, folder / f"motorcycle_{name}.png", SIZE, K, pose, memory=ImageMemory(2**24))
+        for name, K, pose in (("left", K_left, np.eye(4)), ("right", K_right, right_from_left))
     )
+    return StereoPair(left, right, depth.astype(np.float32))
