@@ -66,7 +66,7 @@ class Recipe(Command):
             raise UserError(what, "command line", "use night")
         workers = self._workers()
         init = None if self.init is None else weights_file(self.init)
-        encoder = encoder_file("pretrained") if init is None else None
+        encoder = encoder_file("pretrained", "lite") if init is None else None
         # Looked into before the folder remembers what it was begun with.
         if init is not None:
             load_model(init)

