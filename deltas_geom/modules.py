@@ -59,7 +59,7 @@ class Triangulator(nn.Module):
         weights: Tensor | None = None,
         mask: Tensor | None = None,
     ) -> Triangulation:
-        """Points of matched ``pixels`` (*B, V, N, 2)."""
+        """Points of matched ``pixels`` (*B, V, N, 2); V and N exchanged show in the residual."""
         return triangulate(
             proj, pixels, weights, mask, frame=self.frame, covariance=self.covariance
         )

@@ -68,7 +68,8 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
 
     Args:
         views: V cameras.
-        pixels: ``(*B, V, N, 2)``.
+        pixels: ``(*B, V, N, 2)``. ``(*B, N, V, 2)`` goes unnoticed where N = V: then the points
+            that views see of one scene do not meet.
         depth: ``(*B, V, N)`` metres.
 
     Returns:

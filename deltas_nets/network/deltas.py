@@ -1,7 +1,7 @@
 """DELTAS: the method whole. Start reading here."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,7 @@ from deltas_geom import (
     triangulate,
 )
 from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
+from deltas_geom.records import Record
 from deltas_nets.config import NetworkConfig
 from deltas_nets.network.build import build_stages
 from deltas_nets.network.encoded import Encoded
@@ -27,7 +28,7 @@ from deltas_nets.network.origin import moved_to_anchor
 from deltas_nets.network.records import Posterior
 
 
-class Evidence(NamedTuple):
+class Evidence(Record):
     """What the prediction rests on; training supervises it, notebooks show it.
 
     Attributes:
@@ -41,7 +42,7 @@ class Evidence(NamedTuple):
     dense: DenseDepth
 
 
-class DepthPrediction(NamedTuple):
+class DepthPrediction(Record):
     """Depth of the anchor, and every stage that led to it.
 
     Attributes:

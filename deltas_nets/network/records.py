@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from deltas_geom import (
-    Matches,
-)
+from deltas_geom import Matches
+from deltas_geom.records import Record
 
 
-class Posterior(NamedTuple):
+class Posterior(Record):
     """Belief over inverse depth, as the cross-entropy loss wants it.
 
     Attributes:

@@ -14,13 +14,14 @@ from torch import Tensor, nn
 
 from deltas_geom import SparseDepth
 from deltas_geom.numerics.arithmetic import at_least_single
+from deltas_geom.records import Record
 from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.convex_upsampling import ConvexUpsampling, convex_upsample
 
 
-class DenseDepth(NamedTuple):
+class DenseDepth(Record):
     """Dense depth of the anchor.
 
     Attributes:

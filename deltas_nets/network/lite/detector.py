@@ -4,14 +4,13 @@ Source: DeTone et al., SuperPoint (2018): 65 channels at 1/8, one for each pixel
 cell and one for "none"; the paper, section 3.1, for the mixture.
 """
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 from kornia.geometry.subpix import nms2d
 from torch import Tensor, nn
 
 from deltas_geom.numerics.arithmetic import at_least_single
+from deltas_geom.records import Record
 from deltas_nets.config import DetectorConfig
 from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock, upsample_like, zero_initialised
@@ -20,7 +19,7 @@ CELL = 8
 """Side of a detector cell, pixels."""
 
 
-class Keypoints(NamedTuple):
+class Keypoints(Record):
     """Interest points of the anchor.
 
     Attributes:
