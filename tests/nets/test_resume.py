@@ -58,8 +58,10 @@ def test_the_same_command_with_resume_is_accepted(folder: Path) -> None:
 def test_what_changes_the_result_is_named(
     folder: Path, changes: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(UserError, match=rf"has {message}.*config\.json: leave that option out"):
+    with pytest.raises(UserError) as error:
         resumed_config(folder, asked(**changes), USUAL)
+    assert f"has {message}" in error.value.what and error.value.where == folder / "config.json"
+    assert error.value.remedy.startswith("leave ")
 
 
 def test_no_other_config_continues_a_run(folder: Path) -> None:
