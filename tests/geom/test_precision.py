@@ -107,3 +107,10 @@ def test_what_has_no_tensor_or_no_autocast_is_left_to_the_operation() -> None:
     assert kind(3) == "int" and kind([]) == "list" and kind((), other=torch.ones(1)) == "tuple"
     assert kind(torch.ones(1, device="meta")) == "Tensor"
     assert kind.__name__ == "kind"
+
+
+def test_what_half_precision_cannot_hold_is_its_largest_number() -> None:
+    pixels = torch.tensor([[6e4, -6e4], [torch.nan, torch.inf]], dtype=torch.float16)
+    twice = geom.resize_pixels(pixels, old_size=(4, 4), new_size=(8, 8))
+    wanted = torch.tensor([[65504.0, -65504.0], [torch.nan, torch.inf]], dtype=torch.float16)
+    assert_close(twice, wanted, rtol=0, atol=0, equal_nan=True)

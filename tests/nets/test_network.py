@@ -1,5 +1,7 @@
 """The network: shapes, batch dims, determinism, what each part promises."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given
@@ -74,6 +76,16 @@ def test_shapes_are_as_documented(prediction: DepthPrediction) -> None:
     sizes = [scale.shape[-2:] for scale in prediction.evidence.dense.log_depth]
     assert sizes == [SIZE, (16, 24), (8, 12), (4, 6)]
     assert prediction.evidence.dense.log_spread.shape[-2:] == SIZE
+
+
+def test_a_prediction_comes_back_from_a_file_and_prints_no_numbers(
+    prediction: DepthPrediction, tmp_path: Path
+) -> None:
+    torch.save(prediction.detach(), tmp_path / "prediction.pt")
+    loaded = torch.load(tmp_path / "prediction.pt")
+    assert type(loaded) is DepthPrediction and torch.equal(loaded.depth, prediction.depth)
+    assert prediction.to(torch.float64).points.points.dtype == torch.float64
+    assert "points Triangulation(points (" in repr(prediction) and len(repr(prediction)) < 1200
 
 
 def test_the_anchors_match_is_the_keypoint(prediction: DepthPrediction) -> None:
