@@ -1,0 +1,164 @@
+"""Which single cause explains residuals best."""
+
+import torch
+from torch import Tensor
+
+from deltas_geom.cameras.poses import camera_centers
+from deltas_geom.cameras.views import PosedViews
+from deltas_geom.checks import ShapeError, check_bool, check_shapes
+from deltas_geom.diagnosis.causes import Cause
+from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
+from deltas_geom.diagnosis.hypotheses import Hypothesis, resized
+from deltas_geom.diagnosis.results import Diagnosis
+from deltas_geom.diagnosis.telling import Told
+from deltas_geom.diagnosis.trials import Trial, all_trials, by_camera, explains, tried
+
+_SAME = 1.25  # times as much is as good
+
+
+def diagnose(
+    views: PosedViews, pixels: Tensor, *, mask: Tensor | None = None, threshold: float = 2.0
+) -> Diagnosis:
+    """Which single cause explains best why matches do not fit the cameras, and its cure.
+
+    Poses inverted or with OpenGL's axes, rotations or K transposed, K of images of another size,
+    half a pixel, axes or views of pixels exchanged, one camera with another unit, or one that
+    disagrees with all others: each is mended in turn, for all cameras and for the worst, and the
+    residuals are compared. They are distances in px of matches from what a view sees of another
+    view's ray, which ends at the epipole and at infinity, so that points behind cameras count as
+    wrong; a third of the matches of a pair of views must fit. So up to 30 % of the pixels may be
+    wrong. For people and commands: it looks at values, computes in float64 on the CPU, and has no
+    gradients.
+
+    What matches cannot tell is not guessed: causes that explain as much are all named
+    (``alternatives``), and where all is well, those whose cure would change nothing (``untold``).
+    Cameras that do not turn say nothing of K and little of poses.
+
+    Args:
+        views: V cameras without batch dims.
+        pixels: ``(V, N, 2)`` matches: ``pixels[:, n]`` show one point. NaN = not observed.
+        mask: ``(V, N)`` bool, True = observed.
+        threshold: px, a residual with which all is well. Raise it for rough poses.
+
+    Raises:
+        ShapeError: a shape differs, there are batch dims, or fewer than two views.
+        TypeError: not tensors, or the mask is not bool.
+        ValueError: a camera is not finite, or the threshold not positive.
+
+    Source: Hartley and Zisserman, 2nd ed., sections 9.2 and 21.6 (cheirality).
+
+    Example:
+        >>> from deltas_geom.testing import seeded_scene
+        >>> views, _, pixels = seeded_scene(3, num_views=4, num_points=50)
+        >>> wrong = PosedViews.from_world_from_cam(*views)  # which they were not
+        >>> found = diagnose(wrong, pixels)
+        >>> found.cause.name, found.residual_if_mended < 1e-6
+        ('POSES_INVERTED', True)
+        >>> diagnose(*found.mended[:2]).well
+        True
+    """
+    seen = _checked(views, pixels, mask, threshold)
+    K, pose = (tensor.detach().cpu().double() for tensor in views)
+    where = pixels.detach().cpu().double().nan_to_num()
+    evidence = gather_evidence(where, seen)
+    given = tried(Hypothesis(Cause.ALL_WELL, (), None, K, pose), evidence)
+    told = Told(views, pixels, seen, given, by_camera(given.residual, evidence, len(K)))
+    if not len(evidence.pairs):
+        return told.says(Hypothesis(Cause.TOO_FEW_MATCHES, (), None, K, pose))
+    trials = list(all_trials(given, evidence, where, seen, threshold))
+    chosen = _chosen(given, trials, evidence, threshold)
+    ranked = sorted([given, *trials], key=lambda trial: float(trial.residual.mean()))
+    told = told._replace(ranking=tuple(trial.explanation() for trial in ranked))
+    if chosen is None:
+        return _without_cause(told, trials, evidence, threshold)
+    limit = _SAME * float(chosen.residual[chosen.concerned].mean()) + 0.05
+    same = [
+        trial.explanation()
+        for trial in trials
+        if trial is not chosen
+        and explains(given, trial, threshold)
+        and float(trial.residual[chosen.concerned].mean()) <= limit
+    ]
+    if chosen.what.cause is Cause.CAMERA_DISAGREES:
+        same = []
+    return told.says(chosen.what, chosen, tuple(same))
+
+
+def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: float) -> Tensor:
+    """``(V, N)`` what is observed and finite."""
+    batch = views.check_shapes()
+    check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"))
+    if mask is not None:
+        check_shapes(pixels=(pixels, "V N 2"), mask=(mask, "V N"))
+        check_bool(mask=mask)
+    if len(batch) or pixels.ndim > 3 or (mask is not None and mask.ndim > 2):
+        raise ShapeError("diagnose takes one set of views: no batch dims")
+    if views.num_views < 2:
+        raise ShapeError(f"diagnose needs 2 views or more, got {views.num_views}")
+    if not threshold > 0:
+        raise ValueError(f"threshold must be positive, got {threshold}")
+    for name, tensor in zip(("K", "cam_from_world"), views, strict=True):
+        bad = ~tensor.isfinite().flatten(1).all(dim=-1)
+        if bool(bad.any()):
+            raise ValueError(f"{name} of camera {int(bad.nonzero()[0])} is not finite")
+    finite = pixels.isfinite().all(dim=-1)
+    return (finite if mask is None else finite & mask).cpu()
+
+
+def _chosen(
+    given: Trial, trials: list[Trial], evidence: Evidence, threshold: float
+) -> Trial | None:
+    good = [trial for trial in trials if explains(given, trial, threshold)]
+    # Of equals the first: rounding does not count.
+    best = min(good, key=lambda trial: round(float(trial.residual.mean()), 3), default=None)
+    alone = _disagreeing(given, evidence, threshold)
+    if alone is None:
+        return best
+    rest = float(given.residual[~alone.concerned].mean())
+    fits = best is not None and float(best.residual.mean()) <= 2 * rest + 0.25
+    return best if fits else alone
+
+
+def _disagreeing(given: Trial, evidence: Evidence, threshold: float) -> Trial | None:
+    """The one camera without which all others agree."""
+    for camera in range(len(given.what.K)):
+        concerned = evidence.with_camera(camera)
+        if not bool(concerned.any()) or bool(concerned.all()):
+            continue
+        own, rest = given.residual[concerned], given.residual[~concerned]
+        limit = max(threshold, 3 * float(rest.mean()))
+        apart = min(float(own.mean()), float(own.median())) > limit
+        if apart and float(rest.mean()) <= max(threshold, float(own.mean()) / 6):
+            what = given.what._replace(cause=Cause.CAMERA_DISAGREES, cameras=(camera,))
+            return Trial(what, torch.where(concerned, torch.nan, given.residual), concerned)
+    return None
+
+
+def _without_cause(
+    told: Told, trials: list[Trial], evidence: Evidence, threshold: float
+) -> Diagnosis:
+    """All is well, nothing has parallax, or nothing explains it."""
+    given = told.given
+    residual = float(given.residual.mean())
+    K, pose = given.what.K, given.what.pose
+    centers = camera_centers(pose)
+    one_place = float((centers - centers[0]).abs().max()) <= 1e-9 * float(1 + centers.abs().max())
+    off = displacements(evidence, K, pose)
+    still = float((off <= min(threshold, max(4 * residual, 0.1))).double().mean()) >= 0.9
+    if still or one_place:
+        return told.says(given.what._replace(cause=Cause.NO_BASELINE), moves=not still)
+    if residual > threshold:
+        return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
+    trials = [trial for trial in trials if not trial.what.cameras]
+    for factor in (0.5, 2.0):
+        what = Hypothesis(Cause.K_OF_OTHER_SIZE, (), factor, resized(K, factor), pose)
+        trials.append(tried(what, evidence))
+    limit = _SAME * residual + 0.05
+    untold = [trial.explanation() for trial in trials if float(trial.residual.mean()) <= limit]
+    # A size next to 1 is no other size.
+    untold = [
+        other
+        for other in untold
+        if other.cause is not Cause.K_OF_OTHER_SIZE or not 0.95 < (other.factor or 1) < 1.05
+    ]
+    return told.says(given.what)._replace(untold=tuple(untold))

@@ -1,0 +1,159 @@
+"""How far matches are from where cameras allow them: the measure that hypotheses are judged by."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+LEAST_MATCHES = 8  # of a pair of views
+SHARE = 1 / 3  # of a pair's matches that must fit: with 30 % wrong pixels, half of them do
+CAP = 50.0  # px: beyond, wrong is wrong
+_PARTNERS = 5  # of each view
+_MOST = 96  # matches looked at in a pair
+
+
+class Evidence(NamedTuple):
+    """Matches of pairs of views.
+
+    Attributes:
+        pairs: ``(P, 2)`` views.
+        first: ``(P, M, 2)`` pixels of the pair's first view.
+        second: ``(P, M, 2)`` of its second.
+        counts: ``(P)`` how many of M there are; the others hold NaN.
+    """
+
+    pairs: Tensor
+    first: Tensor
+    second: Tensor
+    counts: Tensor
+
+    def of(self, chosen: Tensor) -> "Evidence":
+        """That of some pairs, ``(P)`` bool."""
+        return Evidence(*(tensor[chosen] for tensor in self))
+
+    def with_camera(self, *cameras: int) -> Tensor:
+        """Which pairs have one of the cameras, ``(P)`` bool."""
+        return torch.isin(self.pairs, torch.tensor(cameras)).any(dim=-1)
+
+
+def gather_evidence(pixels: Tensor, seen: Tensor) -> Evidence:
+    """Pairs of views with the most matches, about five for each or more view.
+
+    Args:
+        pixels: ``(V, N, 2)`` float64, finite where seen.
+        seen: ``(V, N)`` bool.
+    """
+    pairs = choose_pairs(seen)
+    both = seen[pairs[:, 0]] & seen[pairs[:, 1]]
+    counts = both.sum(dim=-1).clamp(max=_MOST)
+    # Evenly over the points, so that all of the image has a say.
+    rank = both.cumsum(dim=-1) - 1
+    total = both.sum(dim=-1, keepdim=True)
+    step = (total / _MOST).clamp(min=1.0)
+    slot = torch.where(both, (rank / step).long(), _MOST).clamp(max=_MOST)
+    points = torch.arange(seen.shape[1]).expand_as(slot)
+    index = torch.zeros(len(pairs), _MOST + 1, dtype=torch.long).scatter(1, slot, points)
+    index = index[:, : int(counts.max()) if len(pairs) else 0]
+    filled = torch.arange(index.shape[1]) < counts[:, None]
+    first, second = (
+        torch.where(filled[..., None], pixels[view[:, None], index], torch.nan)
+        for view in pairs.unbind(dim=-1)
+    )
+    return Evidence(pairs, first, second, counts)
+
+
+def choose_pairs(seen: Tensor) -> Tensor:
+    """``(P, 2)`` pairs with matches enough: all of few views, the richest of many."""
+    views = seen.shape[0]
+    common = seen.double() @ seen.double().mT
+    offset = (torch.arange(views)[:, None] - torch.arange(views)).abs()
+    # Of equally many matches, neighbours and some far ones: 1, 2, 3, 5, 8, ... views apart.
+    steps = torch.tensor([1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
+    nearness = 0.5 / (1 + offset) + 0.5 * torch.isin(offset, steps)
+    score = torch.where((common >= LEAST_MATCHES) & (offset > 0), common + 0.9 * nearness, -1.0)
+    if views > _PARTNERS + 1:
+        best = score.topk(_PARTNERS, dim=-1).indices
+        chosen = torch.zeros_like(score, dtype=torch.bool).scatter(1, best, True) & (score > 0)
+        chosen |= chosen.mT.clone()
+    else:
+        chosen = score > 0
+    return chosen.triu(diagonal=1).nonzero()
+
+
+def residuals(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
+    """Distance in px that a third of a pair's matches keep within, ``(P)``.
+
+    A match is as far off as its pixel in one view is from what that view sees of the other
+    pixel's ray: a half line, from the ray's far end to the epipole. So a point behind a camera
+    is off by its parallax, and without a baseline there is a single right place.
+
+    Args:
+        evidence: of P pairs.
+        K: ``(V, 3, 3)`` any invertible matrices, as they may be transposed.
+        pose: ``(V, 4, 4)`` cam_from_world.
+    """
+    off = _off(evidence, K, pose)
+    return _quantile(torch.maximum(*off.chunk(2)), evidence.counts).clamp(max=CAP)
+
+
+def displacements(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
+    """Distance from points at infinity that 45 % of a pair's matches keep within, ``(P)``."""
+    still = pose.clone()
+    still[:, :3, 3] = 0
+    off = torch.maximum(*_off(evidence, K, still).chunk(2))
+    return _quantile(off, evidence.counts, share=0.45).clamp(max=CAP)
+
+
+def _off(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
+    """``(2 P, M)`` px of the second views' pixels from the first's rays, and the other way."""
+    pairs = torch.cat([evidence.pairs, evidence.pairs.flip(-1)])
+    pixels, others = (
+        torch.cat(both)
+        for both in ((evidence.first, evidence.second), (evidence.second, evidence.first))
+    )
+    a, b = pairs.unbind(dim=-1)
+    rotation, translation = pose[:, :3, :3], pose[:, :3, 3:]
+    turn = rotation[b] @ rotation[a].mT
+    baseline = translation[b] - turn @ translation[a]
+    infinite = (K[b] @ turn @ inverse_up_to_scale(K)[a])[..., None]
+    # By components: small matrix products and reductions over dims of two are slow.
+    px, py = pixels.unbind(dim=-1)
+    fx, fy, fz = (
+        infinite[:, row, 0] * px + infinite[:, row, 1] * py + infinite[:, row, 2]
+        for row in range(3)
+    )
+    nx, ny, nz = (K[b] @ baseline).unbind(dim=-2)  # the epipole, (2 P, 1) each
+    far_ahead, near_ahead = fz > 0, nz > 0
+    # From behind the view, the ray comes from infinity and ends in the epipole.
+    sign = torch.where(far_ahead, 1.0, -1.0).to(fz)
+    x, y = sign * (nx * fz - fx * nz), sign * (ny * fz - fy * nz)
+    length = torch.hypot(x, y)
+    size = (nx.abs() + ny.abs() + nz.abs()) * (fx.abs() + fy.abs() + fz.abs())
+    per_length = torch.where(length > 1e-12 * size, 1 / length, 0.0)
+    x, y = x * per_length, y * per_length
+    at_x = torch.where(far_ahead, fx / fz, nx / nz)
+    at_y = torch.where(far_ahead, fy / fz, ny / nz)
+    reach = torch.hypot(nx / nz - at_x, ny / nz - at_y)
+    reach = torch.where(far_ahead & near_ahead, reach, torch.inf)
+    dx, dy = others[..., 0] - at_x, others[..., 1] - at_y
+    foot = torch.minimum((dx * x + dy * y).clamp(min=0), reach)
+    distance = torch.hypot(dx - foot * x, dy - foot * y)
+    distance = torch.where(far_ahead | near_ahead, distance, torch.inf)
+    return distance.nan_to_num(torch.inf, torch.inf)
+
+
+def inverse_up_to_scale(K: Tensor) -> Tensor:
+    """``(V, 3, 3)`` a positive multiple of the inverse of any K, finite even where it has none.
+
+    A solver's overhead is more than all else here.
+    """
+    x, y, z = K.unbind(dim=-2)
+    columns = [torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)]
+    sign = (x * columns[0]).sum(dim=-1).sign()
+    inverse: Tensor = torch.stack(columns, dim=-1) * sign[:, None, None]
+    return inverse
+
+
+def _quantile(errors: Tensor, counts: Tensor, share: float = SHARE) -> Tensor:
+    rank = ((counts * share).ceil().long() - 1).clamp(min=0)
+    return errors.sort(dim=-1).values.gather(-1, rank[:, None])[:, 0]

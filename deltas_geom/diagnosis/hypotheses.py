@@ -1,0 +1,194 @@
+"""Cameras as they should have been, if a cause were the one."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.cameras.homogeneous import to_homogeneous
+from deltas_geom.cameras.poses import invert_pose
+from deltas_geom.diagnosis.causes import Cause
+from deltas_geom.diagnosis.evidence import Evidence, inverse_up_to_scale, residuals
+
+COMMON_SIZES = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5)
+COMMON_UNITS = (1000.0, 0.001, 100.0, 0.01, 10.0, 0.1, 0.3048, 1 / 0.3048, 0.0254, 1 / 0.0254)
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
+_SWAP = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]).double()
+_SIZES = sorted({*COMMON_SIZES, *(2 ** (step / 8) for step in range(-16, 17) if step)})
+_FINEST = 1e-4  # relative, of factors that are searched
+
+
+class Hypothesis(NamedTuple):
+    """One cause and the cameras without it.
+
+    Attributes:
+        cause: what would have been wrong.
+        cameras: those concerned; empty = all.
+        factor: what K or the translation was to be multiplied by, or the shift of pixels in px.
+        K: ``(V, 3, 3)`` mended.
+        pose: ``(V, 4, 4)`` mended cam_from_world.
+    """
+
+    cause: Cause
+    cameras: tuple[int, ...]
+    factor: float | None
+    K: Tensor
+    pose: Tensor
+
+
+Mend = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+MENDS: dict[Cause, Mend] = {
+    Cause.POSES_INVERTED: lambda K, pose: (K, invert_pose(pose)),
+    Cause.OPENGL_WORLD_FROM_CAM: lambda K, pose: (K, _FLIP @ invert_pose(pose)),
+    Cause.OPENGL_AXES: lambda K, pose: (K, _FLIP @ pose),
+    Cause.ROTATIONS_TRANSPOSED: lambda K, pose: (K, _joined(pose[:, :3, :3].mT, pose[:, :3, 3:])),
+    Cause.CENTERS_AS_TRANSLATIONS: lambda K, pose: (
+        K,
+        _joined(pose[:, :3, :3], -pose[:, :3, :3] @ pose[:, :3, 3:]),
+    ),
+    Cause.K_TRANSPOSED: lambda K, pose: (K.mT, pose),
+    # A camera that sees (row, column) is one whose first two rows are exchanged.
+    Cause.AXES_SWAPPED: lambda K, pose: (_SWAP @ K, pose),
+}
+"""What mends each cause that needs no search, in all of the cameras it is given."""
+
+
+def resized(K: Tensor, factor: float) -> Tensor:
+    """K of images ``factor`` times as large."""
+    half = torch.tensor([[factor, 0, factor / 2 - 0.5], [0, factor, factor / 2 - 0.5], [0, 0, 1]])
+    return half.to(K) @ K
+
+
+def of_all(K: Tensor, pose: Tensor, evidence: Evidence) -> Iterator[Hypothesis]:
+    """Causes that concern all cameras, and exchanged views."""
+    for cause, mend in MENDS.items():
+        yield Hypothesis(cause, (), None, *mend(K, pose))
+    size = best_size(K, pose, evidence)
+    yield Hypothesis(Cause.K_OF_OTHER_SIZE, (), size, resized(K, size), pose)
+    for shift in (-0.5, 0.5):
+        yield Hypothesis(Cause.HALF_A_PIXEL, (), shift, shifted(K, -shift), pose)
+
+
+def of_one(K: Tensor, pose: Tensor, evidence: Evidence, camera: int) -> Iterator[Hypothesis]:
+    """Causes that concern one camera alone; ``evidence`` is that of its pairs."""
+    for cause, mend in MENDS.items():
+        mended = mend(K[[camera]], pose[[camera]])
+        yield Hypothesis(cause, (camera,), None, *replaced(K, pose, camera, *mended))
+    size = best_size(K, pose, evidence, camera)
+    other = replaced(K, pose, camera, resized(K[[camera]], size), pose[[camera]])
+    yield Hypothesis(Cause.K_OF_OTHER_SIZE, (camera,), size, *other)
+    unit = best_unit(K, pose, evidence, camera)
+    yield Hypothesis(Cause.UNIT_OF_TRANSLATION, (camera,), unit, K, with_unit(pose, camera, unit))
+
+
+def exchanged(K: Tensor, pose: Tensor, one: int, other: int) -> Hypothesis:
+    """Pixels of two views exchanged, which is as well two cameras exchanged."""
+    order = torch.arange(len(K))
+    order[[one, other]] = order[[other, one]]
+    return Hypothesis(Cause.VIEWS_SWAPPED, (one, other), None, K[order], pose[order])
+
+
+def best_size(K: Tensor, pose: Tensor, evidence: Evidence, camera: int | None = None) -> float:
+    """Factor of K, of all cameras or of one, with the least residuals."""
+    chosen = slice(None) if camera is None else slice(camera, camera + 1)
+
+    def cost(factor: float) -> float:
+        changed = K.clone()
+        changed[chosen] = resized(K[chosen], factor)
+        return float(residuals(evidence, changed, pose).mean())
+
+    return _searched(cost, _SIZES, COMMON_SIZES, step=2 ** (1 / 8))
+
+
+def best_unit(K: Tensor, pose: Tensor, evidence: Evidence, camera: int) -> float:
+    """Factor of a camera's translation with the least residuals.
+
+    x1^T F x0 = 0 is linear in it: every match votes, the more the longer its epipolar line moves.
+    """
+
+    def cost(factor: float) -> float:
+        return float(residuals(evidence, K, with_unit(pose, camera, factor)).mean())
+
+    without, once = (_epipolar(evidence, K, with_unit(pose, camera, unit)) for unit in (0.0, 1.0))
+    change = once - without
+    votes = -without / change
+    good = votes.isfinite() & (votes > 0)
+    starts = [*COMMON_UNITS]
+    if bool(good.any()):
+        # The middle vote, and those of single pairs, as the wrong matches of some may agree.
+        for some in (
+            votes[good],
+            *(v[g] for v, g in zip(votes, good, strict=True) if bool(g.any())),
+        ):
+            starts.append(float(some.median()))
+    return _searched(cost, starts, COMMON_UNITS, step=1.2)
+
+
+def with_unit(pose: Tensor, camera: int, unit: float) -> Tensor:
+    """Poses with the translation of one multiplied."""
+    changed = pose.clone()
+    changed[camera, :3, 3] *= unit
+    return changed
+
+
+def shifted(K: Tensor, shift: float) -> Tensor:
+    """K with its centre moved by ``shift`` px in x and y."""
+    moved = K.clone()
+    moved[:, :2, 2] += shift
+    return moved
+
+
+def replaced(
+    K: Tensor, pose: Tensor, camera: int, one_K: Tensor, one_pose: Tensor
+) -> tuple[Tensor, Tensor]:
+    """All cameras with one replaced."""
+    K, pose = K.clone(), pose.clone()
+    K[camera], pose[camera] = one_K[0], one_pose[0]
+    return K, pose
+
+
+def _searched(
+    cost: Callable[[float], float], starts: list[float], common: tuple[float, ...], step: float
+) -> float:
+    """The factor of least cost, first among ``starts``, then around the best two of them."""
+    ranked = sorted((cost(factor), factor) for factor in starts)
+    least, best = ranked[0]
+    for value, center in ranked[:2]:
+        width = math.log(step)
+        while width > _FINEST:
+            width *= 0.5
+            for factor in (center * math.exp(-width), center * math.exp(width)):
+                found = cost(factor)
+                if found < value:
+                    value, center = found, factor
+        if value < least:
+            least, best = value, center
+    # A round number, where it is as good.
+    for factor in common:
+        if abs(math.log(best / factor)) < 0.01 and cost(factor) <= 1.1 * least + 0.05:
+            return factor
+    return best
+
+
+def _epipolar(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
+    """``(P, M)`` x1^T F x0."""
+    first, second = evidence.pairs.unbind(dim=-1)
+    inverse = inverse_up_to_scale(K)
+    rotation, translation = pose[:, :3, :3], pose[:, :3, 3]
+    turn = rotation[second] @ rotation[first].mT
+    baseline = translation[second] - (turn @ translation[first, :, None])[..., 0]
+    ray, other = (
+        to_homogeneous(pixels) @ inverse[view].mT
+        for pixels, view in ((evidence.first, first), (evidence.second, second))
+    )
+    lines = torch.linalg.cross(baseline[:, None].expand_as(ray), ray @ turn.mT)
+    found: Tensor = (other * lines).sum(dim=-1)
+    return found
+
+
+def _joined(rotation: Tensor, translation: Tensor) -> Tensor:
+    last = rotation.new_tensor([[0.0, 0, 0, 1]]).expand(len(rotation), 1, 4)
+    return torch.cat([torch.cat([rotation, translation], dim=-1), last], dim=-2)

@@ -1,0 +1,151 @@
+"""A diagnosis in words, and what was given after the cure."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from deltas_geom.cameras.views import PosedViews
+from deltas_geom.diagnosis.causes import CURES, Cause
+from deltas_geom.diagnosis.hypotheses import COMMON_SIZES, Hypothesis
+from deltas_geom.diagnosis.results import Diagnosis, Explanation, Mended
+from deltas_geom.diagnosis.trials import Trial
+
+_UNTOLD = "one scale of all translations"
+
+
+class Told(NamedTuple):
+    """What is known before there is a cause.
+
+    Attributes:
+        views: as given.
+        pixels: as given.
+        seen: ``(V, N)`` bool.
+        given: as given, tried.
+        cameras: ``(V)`` px.
+        ranking: all that was tried.
+    """
+
+    views: PosedViews
+    pixels: Tensor
+    seen: Tensor
+    given: Trial
+    cameras: Tensor
+    ranking: tuple[Explanation, ...] = ()
+
+    def says(
+        self,
+        what: Hypothesis,
+        trial: Trial | None = None,
+        alternatives: tuple[Explanation, ...] = (),
+        *,
+        moves: bool = False,
+    ) -> Diagnosis:
+        """The diagnosis; ``moves``: matches have parallax though cameras have no baseline."""
+        before, after = self._residuals(trial)
+        return Diagnosis(
+            what.cause,
+            self._sentence(what, before, after, moves),
+            _cure(what),
+            what.cameras[0] if what.cameras else None,
+            what.cameras,
+            what.factor,
+            before,
+            after,
+            self.cameras,
+            alternatives,
+            (),
+            self.ranking,
+            self._mended(what),
+        )
+
+    def _residuals(self, trial: Trial | None) -> tuple[float, float]:
+        if trial is None:
+            residual = float(self.given.residual.mean())
+            return residual, residual
+        before = float(self.given.residual[trial.concerned].mean())
+        if trial.what.cause is Cause.CAMERA_DISAGREES:
+            return before, float(self.given.residual[~trial.concerned].mean())
+        return before, float(trial.residual[trial.concerned].mean())
+
+    def _sentence(self, what: Hypothesis, before: float, after: float, moves: bool) -> str:
+        cause = what.cause
+        figures = f"matches are {before:.3g} px off as given, {after:.3g} px with the cure"
+        if cause is Cause.TOO_FEW_MATCHES:
+            return f"{cause.value}"
+        if cause is Cause.ALL_WELL:
+            return f"{cause.value}: matches are {before:.3g} px off"
+        if cause is Cause.NO_SINGLE_CAUSE:
+            order = self.cameras.nan_to_num(-1.0).argsort(descending=True)[:3].tolist()
+            worst = ", ".join(f"camera {view} by {self.cameras[view]:.3g}" for view in order)
+            return f"{cause.value}: matches are {before:.3g} px off ({worst} px)"
+        if cause is Cause.NO_BASELINE and moves:
+            return f"{cause.value}: all cameras stand in one place, yet matches move against it"
+        if cause is Cause.NO_BASELINE:
+            return (
+                f"{cause.value}: rotations explain the matches to {before:.3g} px, cameras turn in "
+                "one place or all is far away; translations cannot be told"
+            )
+        if cause is Cause.CAMERA_DISAGREES:
+            return (
+                f"camera {what.cameras[0]} disagrees with all others: its matches are {before:.3g} "
+                f"px off, those of the others {after:.3g} px"
+            )
+        if cause is Cause.VIEWS_SWAPPED:
+            one, other = what.cameras
+            return f"the pixels of views {one} and {other} are exchanged: {figures}"
+        of = f" (camera {what.cameras[0]} alone)" if what.cameras else ""
+        return f"{cause.value}{of}{_by(what)}: {figures}"
+
+    def _mended(self, what: Hypothesis) -> Mended:
+        views, pixels, seen = self.views, self.pixels, self.seen.to(self.pixels.device)
+        order = list(range(len(seen)))
+        if what.cause is Cause.POINTS_AS_VIEWS:
+            return Mended(views, pixels.transpose(0, 1), seen.mT)
+        if what.cause is Cause.AXES_SWAPPED:
+            chosen = list(what.cameras) or order
+            pixels = pixels.clone()
+            pixels[chosen] = pixels[chosen].flip(-1)
+            return Mended(views, pixels, seen)
+        if what.cause is Cause.HALF_A_PIXEL:
+            return Mended(views, pixels + (what.factor or 0.0), seen)
+        if what.cause is Cause.VIEWS_SWAPPED:
+            one, other = what.cameras
+            order[one], order[other] = other, one
+            return Mended(views, pixels[order], seen[order])
+        if what.cause is Cause.CAMERA_DISAGREES:
+            order.remove(what.cameras[0])
+            return Mended(views.select(order), pixels[order], seen[order])
+        K, pose = what.K.to(views.K), what.pose.to(views.cam_from_world)
+        return Mended(PosedViews(K, pose), pixels, seen)
+
+
+def _by(what: Hypothesis) -> str:
+    """The factor in words."""
+    if what.factor is None:
+        return ""
+    if what.cause is Cause.K_OF_OTHER_SIZE:
+        name = f"{what.factor:.4g}"
+        for size in COMMON_SIZES:
+            if size == what.factor and size < 1:
+                name = f"1/{1 / size:.3g}"
+        return f", which are {1 / what.factor:.4g} times as large (K times {name} is right)"
+    if what.cause is Cause.HALF_A_PIXEL:
+        return f" (pixels {what.factor:+g} px are right)"
+    unit = {1e-3: ", millimetres", 0.01: ", centimetres", 0.3048: ", feet", 0.0254: ", inches"}
+    return f"{unit.get(what.factor, '')} (times {what.factor:.4g} is right)"
+
+
+def _cure(what: Hypothesis) -> str:
+    cure = CURES[what.cause]
+    if what.cause is Cause.K_OF_OTHER_SIZE:
+        cure = f"{cure}, the images {what.factor:.4g} times as large as K's"
+    if what.cause is Cause.UNIT_OF_TRANSLATION:
+        cure = f"poses[{what.cameras[0]}, :3, 3] *= {what.factor:.4g}"
+    if what.cause is Cause.CAMERA_DISAGREES:
+        return f"leave it out, mask[{what.cameras[0]}] = False, or find its pose anew"
+    if what.cause is Cause.VIEWS_SWAPPED:
+        one, other = what.cameras
+        return f"pixels[[{one}, {other}]] = pixels[[{other}, {one}]], or exchange the cameras"
+    if what.cameras and what.cause is not Cause.UNIT_OF_TRANSLATION:
+        return f"of camera {what.cameras[0]} alone: {cure}"
+    return cure

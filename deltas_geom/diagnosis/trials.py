@@ -1,0 +1,98 @@
+"""Hypotheses tried on the evidence."""
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.diagnosis.causes import Cause
+from deltas_geom.diagnosis.evidence import Evidence, gather_evidence, residuals
+from deltas_geom.diagnosis.hypotheses import Hypothesis, exchanged, of_all, of_one
+from deltas_geom.diagnosis.results import Explanation
+
+_EXACT = 0.02  # px: rounding of float32
+_SUSPECTS = 3
+
+
+class Trial(NamedTuple):
+    """A hypothesis and what it makes of every pair.
+
+    Attributes:
+        what: the hypothesis; as given, ALL_WELL.
+        residual: ``(P)`` px.
+        concerned: ``(P)`` bool, the pairs that it changes.
+    """
+
+    what: Hypothesis
+    residual: Tensor
+    concerned: Tensor
+
+    def explanation(self) -> Explanation:
+        """In short."""
+        cause, cameras, factor, *_ = self.what
+        return Explanation(cause, cameras, factor, float(self.residual.mean()))
+
+
+def tried(what: Hypothesis, evidence: Evidence, given: Trial | None = None) -> Trial:
+    """A hypothesis on the evidence; what it leaves alone is taken from ``given``."""
+    if given is None or not what.cameras:
+        found = residuals(evidence, what.K, what.pose)
+        return Trial(what, found, torch.ones_like(found, dtype=torch.bool))
+    concerned = evidence.with_camera(*what.cameras)
+    found = given.residual.clone()
+    found[concerned] = residuals(evidence.of(concerned), what.K, what.pose)
+    return Trial(what, found, concerned)
+
+
+def all_trials(
+    given: Trial, evidence: Evidence, pixels: Tensor, seen: Tensor, threshold: float
+) -> Iterator[Trial]:
+    """Everything tried. Single cameras only where some pair is off: that takes longest."""
+    K, pose = given.what.K, given.what.pose
+    explained = False
+    for what in of_all(K, pose, evidence):
+        trial = tried(what, evidence)
+        explained |= explains(given, trial, threshold) and bool(
+            (trial.residual <= max(threshold, float(given.residual.mean()) / 10)).all()
+        )
+        yield trial
+    if len(K) == seen.shape[1]:
+        turned = gather_evidence(pixels.transpose(0, 1), seen.mT)
+        if len(turned.pairs):
+            what = Hypothesis(Cause.POINTS_AS_VIEWS, (), None, K, pose)
+            alike = torch.full_like(given.residual, float(residuals(turned, K, pose).mean()))
+            yield Trial(what, alike, given.concerned)
+    # What mends all pairs of many cameras is no single camera's.
+    if float(given.residual.max()) <= threshold or (explained and len(K) > 3):
+        return
+    worst = by_camera(given.residual, evidence, len(K)).nan_to_num(-1.0).argsort(descending=True)
+    few = range(len(K)) if len(K) <= 6 else sorted(worst[: _SUSPECTS + 1].tolist())
+    for one, other in combinations(few, 2):
+        yield tried(exchanged(K, pose, one, other), evidence, given)
+    for camera in worst[:_SUSPECTS].tolist():
+        of_camera = evidence.of(evidence.with_camera(camera))
+        if len(of_camera.pairs):
+            for what in of_one(K, pose, of_camera, camera):
+                yield tried(what, evidence, given)
+
+
+def explains(given: Trial, trial: Trial, threshold: float) -> bool:
+    """Whether so much less is left that it is no accident."""
+    before = float(given.residual[trial.concerned].mean())
+    after = float(trial.residual[trial.concerned].mean())
+    if before > threshold and after <= 0.5 * before:
+        return after <= threshold or after <= 0.25 * before
+    return before > _EXACT and after <= 0.1 * before
+
+
+def by_camera(residual: Tensor, evidence: Evidence, views: int) -> Tensor:
+    """``(V)`` px, the mean of each camera's pairs."""
+    means = [
+        residual[evidence.with_camera(camera)].mean()
+        if bool(evidence.with_camera(camera).any())
+        else residual.new_tensor(torch.nan)
+        for camera in range(views)
+    ]
+    return torch.stack(means)
