@@ -51,9 +51,10 @@ class PosedViews(Record):
 
         That of a camera that is not finite is NaN, so that triangulation can tell.
         """
-        (K, cam_from_world), finite, _ = finite_views(self)
-        K, cam_from_world = promoted(K, cam_from_world)
-        return torch.where(finite[..., None, None], K @ cam_from_world[..., :3, :], torch.nan)
+        self.check_shapes()
+        K, cam_from_world = promoted(*self)
+        (K, known), (poses, posed) = (finite_or_zero(x, dims=2) for x in (K, cam_from_world))
+        return torch.where((known & posed)[..., None, None], K @ poses[..., :3, :], torch.nan)
 
     @property
     def num_views(self) -> int:

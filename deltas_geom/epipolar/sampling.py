@@ -128,12 +128,13 @@ def sample_inv_depths(
     check_shapes(pixels=(pixels, "N 2"), inv_depths=(inv_depths, "S"))
     rays = epipolar_rays(views, pixels)
     inv_depths, known = finite_or_zero(inv_depths, dims=0)
+    reach = torch.where(known, inv_depths.detach().abs(), torch.inf)  # nothing is that far ahead
     if inv_depths.ndim > 1:
-        inv_depths, known = inv_depths.unsqueeze(-3), known.unsqueeze(-3)
+        inv_depths, reach = inv_depths.unsqueeze(-3), reach.unsqueeze(-3)
     inv_depth = inv_depths.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depths.shape))
     homogeneous = rays.at(inv_depth)
-    least = rays.clearance[..., None] + inv_depth.detach().abs() * rays.clearance_slope[..., None]
-    in_front = (homogeneous[..., 2] > least) & rays.usable[..., None] & known
+    least = rays.clearance[..., None] + reach * rays.clearance_slope[..., None]
+    in_front = (homogeneous[..., 2] > least) & rays.usable[..., None]
     where = safe_divide(homogeneous[..., :2], homogeneous[..., 2:], in_front[..., None])
     mask = in_front & in_image(where, image_size=image_size)
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
