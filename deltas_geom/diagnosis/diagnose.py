@@ -11,7 +11,7 @@ from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evide
 from deltas_geom.diagnosis.hypotheses import Hypothesis, resized
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.telling import Told
-from deltas_geom.diagnosis.trials import Trial, all_trials, by_camera, explains, tried
+from deltas_geom.diagnosis.trials import Trial, all_trials, by_camera, explains, level, tried
 
 _SAME = 1.25  # times as much is as good
 
@@ -112,11 +112,24 @@ def _chosen(
     # Of equals the first: rounding does not count.
     best = min(good, key=lambda trial: round(float(trial.residual.mean()), 3), default=None)
     alone = _disagreeing(given, evidence, threshold)
-    if alone is None:
+    limit = 0.0 if best is None else _SAME * level(best.residual[best.concerned]) + 0.05
+    if alone is not None:
+        rest = 2 * level(given.residual[~alone.concerned]) + 0.25
+        if best is None or level(best.residual[alone.concerned]) > rest:
+            best, limit = alone, rest
+    if best is None or len(best.what.cameras) != 1:
         return best
-    rest = float(given.residual[~alone.concerned].mean())
-    fits = best is not None and float(best.residual.mean()) <= 2 * rest + 0.25
-    return best if fits else alone
+    # One camera is concerned, but if all were, it would be as well: the simpler is right.
+    on = best.concerned
+    rivals = [
+        trial
+        for trial in trials
+        if not trial.what.cameras
+        and explains(given, trial, threshold, on=on)
+        and level(trial.residual[on]) <= limit
+        and float(trial.residual[~on].sum()) <= float(_SAME * given.residual[~on].sum()) + 0.05
+    ]
+    return min(rivals, key=lambda trial: float(trial.residual.mean()), default=best)
 
 
 def _disagreeing(given: Trial, evidence: Evidence, threshold: float) -> Trial | None:
@@ -126,9 +139,9 @@ def _disagreeing(given: Trial, evidence: Evidence, threshold: float) -> Trial | 
         if not bool(concerned.any()) or bool(concerned.all()):
             continue
         own, rest = given.residual[concerned], given.residual[~concerned]
-        limit = max(threshold, 3 * float(rest.mean()))
-        apart = min(float(own.mean()), float(own.median())) > limit
-        if apart and float(rest.mean()) <= max(threshold, float(own.mean()) / 6):
+        limit = max(threshold, 3 * level(rest))
+        apart = level(own) > limit and float((own > limit).double().mean()) > 0.6
+        if apart and level(rest) <= max(threshold, level(own) / 6):
             what = given.what._replace(cause=Cause.CAMERA_DISAGREES, cameras=(camera,))
             return Trial(what, torch.where(concerned, torch.nan, given.residual), concerned)
     return None
@@ -139,7 +152,7 @@ def _without_cause(
 ) -> Diagnosis:
     """All is well, nothing has parallax, or nothing explains it."""
     given = told.given
-    residual = float(given.residual.mean())
+    residual = level(given.residual)
     K, pose = given.what.K, given.what.pose
     centers = camera_centers(pose)
     one_place = float((centers - centers[0]).abs().max()) <= 1e-9 * float(1 + centers.abs().max())
@@ -147,18 +160,20 @@ def _without_cause(
     still = float((off <= min(threshold, max(4 * residual, 0.1))).double().mean()) >= 0.9
     if still or one_place:
         return told.says(given.what._replace(cause=Cause.NO_BASELINE), moves=not still)
-    if residual > threshold:
+    if not _well(given, evidence, threshold):
         return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
     trials = [trial for trial in trials if not trial.what.cameras]
     for factor in (0.5, 2.0):
         what = Hypothesis(Cause.K_OF_OTHER_SIZE, (), factor, resized(K, factor), pose)
         trials.append(tried(what, evidence))
     limit = _SAME * residual + 0.05
-    untold = [trial.explanation() for trial in trials if float(trial.residual.mean()) <= limit]
-    # A size next to 1 is no other size.
-    untold = [
-        other
-        for other in untold
-        if other.cause is not Cause.K_OF_OTHER_SIZE or not 0.95 < (other.factor or 1) < 1.05
-    ]
+    untold = [trial.explanation() for trial in trials if level(trial.residual) <= limit]
     return told.says(given.what)._replace(untold=tuple(untold))
+
+
+def _well(given: Trial, evidence: Evidence, threshold: float) -> bool:
+    """Four fifths of the pairs fit, and a third of each camera's: no camera is out of place."""
+    fit = given.residual <= threshold
+    each = [fit[evidence.with_camera(camera)] for camera in range(len(given.what.K))]
+    shares = [float(own.double().mean()) for own in each if len(own)]
+    return float(fit.double().mean()) >= 0.8 and min(shares) >= 0.3

@@ -1,5 +1,6 @@
 """A diagnosis in words, and what was given after the cure."""
 
+import math
 from typing import NamedTuple
 
 from torch import Tensor
@@ -8,9 +9,7 @@ from deltas_geom.cameras.views import PosedViews
 from deltas_geom.diagnosis.causes import CURES, Cause
 from deltas_geom.diagnosis.hypotheses import COMMON_SIZES, Hypothesis
 from deltas_geom.diagnosis.results import Diagnosis, Explanation, Mended
-from deltas_geom.diagnosis.trials import Trial
-
-_UNTOLD = "one scale of all translations"
+from deltas_geom.diagnosis.trials import Trial, level
 
 
 class Told(NamedTuple):
@@ -60,12 +59,13 @@ class Told(NamedTuple):
 
     def _residuals(self, trial: Trial | None) -> tuple[float, float]:
         if trial is None:
-            residual = float(self.given.residual.mean())
+            # Of all pairs; a few with wrong matches do not count.
+            residual = level(self.given.residual) if len(self.given.residual) else math.nan
             return residual, residual
-        before = float(self.given.residual[trial.concerned].mean())
+        before = level(self.given.residual[trial.concerned])
         if trial.what.cause is Cause.CAMERA_DISAGREES:
-            return before, float(self.given.residual[~trial.concerned].mean())
-        return before, float(trial.residual[trial.concerned].mean())
+            return before, level(self.given.residual[~trial.concerned])
+        return before, level(trial.residual[trial.concerned])
 
     def _sentence(self, what: Hypothesis, before: float, after: float, moves: bool) -> str:
         cause = what.cause
@@ -73,7 +73,9 @@ class Told(NamedTuple):
         if cause is Cause.TOO_FEW_MATCHES:
             return f"{cause.value}"
         if cause is Cause.ALL_WELL:
-            return f"{cause.value}: matches are {before:.3g} px off"
+            off = int((self.given.residual > 3 * before + 1).sum())
+            but = f", but in {off} of {len(self.given.residual)} pairs of views" if off else ""
+            return f"{cause.value}: matches are {before:.3g} px off{but}"
         if cause is Cause.NO_SINGLE_CAUSE:
             order = self.cameras.nan_to_num(-1.0).argsort(descending=True)[:3].tolist()
             worst = ", ".join(f"camera {view} by {self.cameras[view]:.3g}" for view in order)

@@ -52,7 +52,7 @@ def all_trials(
     """Everything tried. Single cameras only where some pair is off: that takes longest."""
     K, pose = given.what.K, given.what.pose
     explained = False
-    for what in of_all(K, pose, evidence):
+    for what in _told_apart(of_all(K, pose, evidence)):
         trial = tried(what, evidence)
         explained |= explains(given, trial, threshold) and bool(
             (trial.residual <= max(threshold, float(given.residual.mean()) / 10)).all()
@@ -74,17 +74,43 @@ def all_trials(
     for camera in worst[:_SUSPECTS].tolist():
         of_camera = evidence.of(evidence.with_camera(camera))
         if len(of_camera.pairs):
-            for what in of_one(K, pose, of_camera, camera):
+            for what in _told_apart(of_one(K, pose, of_camera, camera)):
                 yield tried(what, evidence, given)
 
 
-def explains(given: Trial, trial: Trial, threshold: float) -> bool:
-    """Whether so much less is left that it is no accident."""
-    before = float(given.residual[trial.concerned].mean())
-    after = float(trial.residual[trial.concerned].mean())
+def _told_apart(hypotheses: Iterator[Hypothesis]) -> Iterator[Hypothesis]:
+    """Without factors next to 1: a lens or a pose that is a little wrong is no other unit."""
+    for what in hypotheses:
+        if what.cause is Cause.HALF_A_PIXEL or not 0.93 < (what.factor or 0.0) < 1.08:
+            yield what
+
+
+def explains(given: Trial, trial: Trial, threshold: float, *, on: Tensor | None = None) -> bool:
+    """Whether so much less is left that it is no accident.
+
+    Args:
+        given: as given.
+        trial: to be judged.
+        threshold: px.
+        on: ``(P)`` bool, the pairs that count; those that the trial concerns unless given.
+    """
+    on = trial.concerned if on is None else on
+    # All matches of some of many pairs may be wrong; of one camera's few pairs all count.
+    of = level if bool(on.all()) else _mean
+    before, after = of(given.residual[on]), of(trial.residual[on])
     if before > threshold and after <= 0.5 * before:
         return after <= threshold or after <= 0.25 * before
     return before > _EXACT and after <= 0.1 * before
+
+
+def _mean(residual: Tensor) -> float:
+    return float(residual.mean())
+
+
+def level(residual: Tensor) -> float:
+    """Mean of the best four fifths of pairs, px: all matches of some may be wrong."""
+    kept = -(-4 * len(residual) // 5)
+    return float(residual.sort().values[:kept].mean())
 
 
 def by_camera(residual: Tensor, evidence: Evidence, views: int) -> Tensor:
