@@ -6,6 +6,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from deltas_geom.records import mapped, tensors_of
 
@@ -103,3 +104,29 @@ def _rounded(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     largest = torch.finfo(dtype).max
     kept = tensor.abs() == torch.inf  # what an item that is not finite holds, as NaN
     return torch.where(kept, tensor, tensor.clamp(-largest, largest)).to(dtype)
+
+
+def solver_dtype(tensor: Tensor) -> torch.dtype:
+    """The type to compute in: float64, whatever the input, where the device has it."""
+    # Apple's devices have no float64; there the rig frame alone keeps float32 usable.
+    return torch.float32 if tensor.device.type == "mps" else torch.float64
+
+
+def values_at_hand(tensor: Tensor) -> bool:
+    """May what is computed depend on values: nobody traces it, and no other device has them?
+
+    In forward mode they have tangents, which are lost where values leave torch.
+    """
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
+        return False
+    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+        return False
+    return type(tensor) is Tensor and tensor.device.type == "cpu"
+
+
+def surely_all(mask: Tensor) -> bool:
+    """Whether all is true, where that may be asked at no cost; elsewhere False.
+
+    What holds for all points need not be told from point to point.
+    """
+    return values_at_hand(mask) and bool(mask.all())

@@ -1,48 +1,104 @@
-"""Functions that keep only their inputs for backward, and compute what lies between again.
+"""How results are computed: in which type, some points at a time, keeping only inputs for backward.
 
-What lies between a function's inputs and its outputs is usually many times larger than both.
-Derivatives of any order are autograd's, of the second computation.
+What lies between a function's inputs and its outputs is usually many times larger than both, so
+backward computes it again, and points are cut into chunks that stay in the cache. All that depends
+on who calls (a compiler, a transform of ``torch.func``, forward mode) is here.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from deltas_geom.numerics.sums import SERIAL
 
-class WithLagrangian:
+_CHUNK, _SMALLEST_CHUNK = 16384, 512  # points
+
+Function = Callable[..., tuple[Tensor, ...]]
+Inputs = tuple[Tensor | None, ...]
+
+
+class WithAdjoint:
     """A function of :func:`recomputed` whose gradient needs less than the function again.
 
     Where outputs solve equations, the gradient follows from the equations and the solution,
-    however that was found. The first output alone has a gradient; the others are kept too.
+    however that was found.
 
     Attributes:
-        function: as for :func:`recomputed`.
-        lagrangian: from the other outputs, the gradient of the first, and the inputs: a tensor
-            whose sum has the derivatives of sum(gradient * output) by the inputs, to first order.
+        function: as for :func:`recomputed`; its first output alone has a gradient.
+        adjoint: from the gradients of the outputs, which inputs need one, and the inputs: the
+            gradient of each input or None, to first order.
 
     Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 15 (implicit).
     """
 
     def __init__(
-        self,
-        function: Callable[..., tuple[Tensor, ...]],
-        lagrangian: Callable[..., Tensor],
+        self, function: Function, adjoint: Callable[..., tuple[Tensor | None, ...]]
     ) -> None:
         self.function = function
-        self.lagrangian = lagrangian
+        self.adjoint = adjoint
 
     def __call__(self, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         """All outputs, differentiably."""
         return self.function(*tensors)
 
 
+class Cut(NamedTuple):
+    """How a function of many points is computed some points at a time.
+
+    Attributes:
+        size: points at a time.
+        inputs: for each input the dim, from the end, along which it holds points; 0 if it is whole
+            in every chunk.
+        outputs: the same of each output.
+    """
+
+    size: int
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+
+
+def cut_points(
+    tensor: Tensor, *dims: int, outputs: tuple[int, ...], parts: bool = False
+) -> Cut | None:
+    """A cut for cameras and what is known of points, of which ``tensor`` ``(*B, V, N, K)`` tells N.
+
+    Args:
+        tensor: along whose second to last dim points lie. So few are taken at a time that no
+            operation on all their views starts threads.
+        *dims: of the inputs after the cameras.
+        outputs: of the outputs.
+        parts: will the function itself take some points at a time where it looks at views?
+    """
+    # A compiler fuses what lies between instead, and may not know the number of points.
+    if torch.compiler.is_compiling():
+        return None
+    few = serial_points(tensor)
+    whole = _CHUNK // max(1, tensor.shape[:-3].numel())
+    size = few * max(1, round(whole / few)) if parts else few
+    return Cut(_alike(tensor.shape[-2], size), (0, *dims), outputs)
+
+
+def serial_points(tensor: Tensor) -> int:
+    """How many points of ``(*B, V, N, K)`` all operations on their views compute in one thread."""
+    if torch.get_num_threads() == 1:
+        return _CHUNK
+    return max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
+
+
+def _alike(count: int, size: int) -> int:
+    """Points a chunk: a small one at the end would cost as many calls as a whole one."""
+    return max(1, -(-count // max(1, -(-count // size))))
+
+
 def recomputed(
-    function: Callable[..., tuple[Tensor, ...]],
+    function: Function,
     *tensors: Tensor | None,
-    values: Callable[..., tuple[Tensor, ...]] | None = None,
+    values: Function | None = None,
+    cut: Cut | None = None,
 ) -> tuple[Tensor, ...]:
     """``function(*tensors)``, keeping nothing but ``tensors`` for its backward pass.
 
@@ -54,6 +110,7 @@ def recomputed(
             point have no gradient.
         *tensors: inputs; those in a closure get no gradient.
         values: the same outputs by a faster route that need not be differentiable.
+        cut: compute some points at a time.
 
     Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 12 (checkpointing).
 
@@ -63,23 +120,52 @@ def recomputed(
         >>> torch.autograd.grad(y.sum(), x)[0].allclose((x.exp().cos() * x.exp()))
         True
     """
-    if torch._C._are_functorch_transforms_active() or any(map(_has_tangent, tensors)):
+    if transformed(*tensors):
         return function(*tensors)
+    values = function if values is None else values
+    compiling = torch.compiler.is_compiling()
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)):
         with torch.no_grad():
-            return (function if values is None else values)(*tensors)
-    if torch.compiler.is_compiling():
-        return _applied(_Traced, function, function if values is None else values, *tensors)
-    return _applied(_Recomputed, function, function if values is None else values, *tensors)
-
-
-def _applied(kind: type[torch.autograd.Function], *inputs: Any) -> tuple[Tensor, ...]:
-    outputs: tuple[Tensor, ...] = kind.apply(*inputs)  # type: ignore[no-untyped-call]
+            return _by_chunks(values, cut, *tensors)
+    kind = _Traced if compiling else _Recomputed
+    outputs: tuple[Tensor, ...] = kind.apply(function, values, cut, *tensors)  # type: ignore[no-untyped-call]
     return outputs
 
 
+def _chunks(cut: Cut, tensors: Sequence[Tensor | None], dims: Sequence[int]) -> Iterator[Inputs]:
+    """The tensors of each chunk."""
+    count = next(t.shape[d] for t, d in zip(tensors, dims, strict=True) if t is not None and d)
+    for start in range(0, max(1, count), cut.size):
+        yield tuple(
+            t if t is None or d == 0 else t.narrow(d, start, min(cut.size, count - start))
+            for t, d in zip(tensors, dims, strict=True)
+        )
+
+
+def _by_chunks(function: Function, cut: Cut | None, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+    if cut is None:
+        return function(*tensors)
+    parts = [function(*some) for some in _chunks(cut, tensors, cut.inputs)]
+    return tuple(map(joined, zip(*parts, strict=True), cut.outputs))
+
+
+def joined(parts: Sequence[Tensor], dim: int) -> Tensor:
+    """The parts as one tensor, copied in pieces for which no threads are started."""
+    if len(parts) == 1:
+        return parts[0]
+    few = max(1, SERIAL * parts[0].shape[dim] // max(1, parts[0].numel()))
+    if few < parts[0].shape[dim]:
+        parts = [piece for part in parts for piece in part.split(few, dim)]
+    return torch.cat(list(parts), dim)
+
+
+def transformed(*tensors: Tensor | None) -> bool:
+    """Does a transform of ``torch.func`` run, or forward mode?"""
+    return torch._C._are_functorch_transforms_active() or any(map(_has_tangent, tensors))
+
+
 def _has_tangent(tensor: Tensor | None) -> bool:
-    if tensor is None:
+    if tensor is None or forward_ad._current_level < 0:
         return False
     tangent = forward_ad.unpack_dual(tensor).tangent  # type: ignore[no-untyped-call]
     return tangent is not None
@@ -95,60 +181,86 @@ def _in_batch(tensor: Tensor | None) -> bool:
 class _Recomputed(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        function: Callable[..., tuple[Tensor, ...]],
-        values: Callable[..., tuple[Tensor, ...]],
-        *tensors: Tensor | None,
+        ctx: Any, function: Function, values: Function, cut: Cut | None, *tensors: Tensor | None
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
-        return _kept(ctx, function, values, tensors)
+        ctx.cut = cut
+        return _kept(ctx, function, partial(_by_chunks, values, cut), tensors)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[2:]
-        higher = torch.is_grad_enabled()  # a second derivative is wanted of what is done here
-        tensors, found = ctx.saved_tensors[: len(needed)], ctx.saved_tensors[len(needed) :]
-        inputs = [
-            tensor if tensor is None or higher else tensor.detach().requires_grad_(asked)
-            for tensor, asked in zip(tensors, needed, strict=True)
-        ]
-        # A sum of gradients in a batch could not tell one from the other.
-        batched = _in_batch(gradients[0])
-        with torch.enable_grad():
-            if isinstance(ctx.function, WithLagrangian) and not (higher or batched):
-                if gradients[0] is None:
-                    return (None, None, *(None for _ in inputs))
-                outputs = (ctx.function.lagrangian(found, gradients[0], *inputs),)
-                gradients = (torch.ones_like(outputs[0]),)
-            else:
-                outputs = ctx.function(*inputs)
-        followed = [
-            (output, gradient)
-            for output, gradient in zip(outputs, gradients, strict=True)
-            if gradient is not None and output.requires_grad
-        ]
-        wanted = [tensor for tensor, asked in zip(inputs, needed, strict=True) if asked]
-        if not followed:
-            return (None, None, *(None for _ in inputs))
-        pulled = iter(
-            torch.autograd.grad(
-                [output for output, _ in followed],
-                [tensor for tensor in wanted if tensor is not None],
-                [gradient for _, gradient in followed],
-                create_graph=higher,
-                allow_unused=True,
-            )
+        needed, function, cut, tensors = (
+            ctx.needs_input_grad[3:],
+            ctx.function,
+            ctx.cut,
+            ctx.saved_tensors,
         )
-        return (None, None, *(next(pulled) if asked else None for asked in needed))
+        nothing = (None,) * (3 + len(tensors))
+        if all(gradient is None for gradient in gradients):
+            return nothing
+        if torch.is_grad_enabled():  # a second derivative is wanted of what is done here
+            return (
+                *nothing[:3],
+                *_pulled(function, gradients, needed, *tensors, create_graph=True),
+            )
+        # A sum of gradients in a batch could not tell one from the other.
+        pull = partial(_pulled, function)
+        if isinstance(function, WithAdjoint) and not any(map(_in_batch, gradients)):
+            pull = function.adjoint
+        if cut is None:
+            return (*nothing[:3], *pull(gradients, needed, *tensors))
+        chunks = zip(
+            _chunks(cut, gradients, cut.outputs), _chunks(cut, tensors, cut.inputs), strict=True
+        )
+        parts = zip(*(pull(some, needed, *inputs) for some, inputs in chunks), strict=True)
+        return (*nothing[:3], *map(_together, parts, cut.inputs))
+
+
+def _together(parts: tuple[Tensor | None, ...], dim: int) -> Tensor | None:
+    """The gradient of an input from those of its chunks, which are all None or none."""
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    return joined(known, dim) if dim else sum(known[1:], known[0])
+
+
+def _pulled(
+    function: Function,
+    gradients: Sequence[Tensor | None],
+    needed: Sequence[bool],
+    *tensors: Tensor | None,
+    create_graph: bool = False,
+) -> tuple[Tensor | None, ...]:
+    """Gradients of the inputs by those of the outputs."""
+    inputs = [
+        t if t is None or create_graph else t.detach().requires_grad_(asked)
+        for t, asked in zip(tensors, needed, strict=True)
+    ]
+    with torch.enable_grad():
+        outputs = function(*inputs)
+    followed = [
+        (output, gradient)
+        for output, gradient in zip(outputs, gradients, strict=True)
+        if gradient is not None and output.requires_grad
+    ]
+    if not followed:
+        return (None,) * len(inputs)
+    pulled = iter(
+        torch.autograd.grad(
+            [output for output, _ in followed],
+            [t for t, asked in zip(inputs, needed, strict=True) if t is not None and asked],
+            [gradient for _, gradient in followed],
+            create_graph=create_graph,
+            allow_unused=True,
+        )
+    )
+    return tuple(next(pulled) if asked else None for asked in needed)
 
 
 class _Traced(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        function: Callable[..., tuple[Tensor, ...]],
-        values: Callable[..., tuple[Tensor, ...]],
-        *tensors: Tensor | None,
+        ctx: Any, function: Function, values: Function, cut: Cut | None, *tensors: Tensor | None
     ) -> tuple[Tensor, ...]:
         outputs = _kept(ctx, function, values, tensors)
         ctx.floating = tuple(out.is_floating_point() for out in outputs)
@@ -156,42 +268,35 @@ class _Traced(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[2:]
-        tensors, found = ctx.saved_tensors[: len(needed)], ctx.saved_tensors[len(needed) :]
-        function = ctx.function
+        needed, function, tensors = ctx.needs_input_grad[3:], ctx.function, ctx.saved_tensors
         followed = tuple(g for g, has in zip(gradients, ctx.floating, strict=True) if has)
         # What depends on inputs alone the compiler would compute in the forward pass, and keep.
         never = (followed[0] > torch.inf).any()
         tensors = [None if t is None else torch.where(never, t.new_zeros(()), t) for t in tensors]
+        if isinstance(function, WithAdjoint):
+            return (None, None, None, *function.adjoint(followed, needed, *tensors))
         places = [k for k, t in enumerate(tensors) if t is not None and needed[k]]
 
         def of_needed(*needed: Tensor) -> tuple[Tensor, ...]:
             inputs = list(tensors)
             for place, tensor in zip(places, needed, strict=True):
                 inputs[place] = tensor
-            if isinstance(function, WithLagrangian):
-                return (function.lagrangian(found, followed[0], *inputs),)
             return tuple(out for out in function(*inputs) if out.is_floating_point())
 
-        outputs, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
-        if isinstance(function, WithLagrangian):
-            followed = (torch.ones_like(outputs[0]),)
+        _, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
         pulled = dict(zip(places, pull(followed), strict=True))
-        return (None, None, *(pulled.get(k) for k in range(len(tensors))))
+        return (None, None, None, *(pulled.get(k) for k in range(len(tensors))))
 
 
 def _kept(
-    ctx: Any,
-    function: Callable[..., tuple[Tensor, ...]],
-    values: Callable[..., tuple[Tensor, ...]],
-    tensors: tuple[Tensor | None, ...],
+    ctx: Any, function: Function, values: Function, tensors: tuple[Tensor | None, ...]
 ) -> tuple[Tensor, ...]:
     """The values, after ``ctx`` was told what to keep for backward."""
     ctx.function = function
+    ctx.save_for_backward(*tensors)
     outputs = values(*tensors)
-    short = isinstance(function, WithLagrangian)
-    ctx.save_for_backward(*tensors, *(outputs[1:] if short else ()))
+    first_only = isinstance(function, WithAdjoint)
     ctx.mark_non_differentiable(
-        *(out for k, out in enumerate(outputs) if (short and k > 0) or not out.is_floating_point())
+        *(out for k, out in enumerate(outputs) if (first_only and k) or not out.is_floating_point())
     )
     return outputs

@@ -138,60 +138,6 @@ def _to_solve_with(pivots: Pivots) -> Factors:
     return Factors(pivots, (pivots.i0 * d3, pivots.i1 * d3, pivots.i2 * d3))
 
 
-def factor_columns(columns: Vector4) -> Factors:
-    """LDL^T of A^T A from A itself, by modified Gram-Schmidt: as exact as a QR of A.
-
-    :func:`factor` of the product knows eigenvalues only down to rounding of the largest; this
-    knows their roots so.
-
-    Args:
-        columns: four ``(*B, R, N)`` of N matrices A, each of R rows.
-    """
-    a0, a1, a2, a3 = columns
-    i0 = _over_rows(a0, a0).reciprocal()
-    l10, l20, l30 = (_over_rows(a0, a) * i0 for a in (a1, a2, a3))
-    a1, a2, a3 = _less_column(a1, l10, a0), _less_column(a2, l20, a0), _less_column(a3, l30, a0)
-    i1 = _over_rows(a1, a1).reciprocal()
-    l21, l31 = _over_rows(a1, a2) * i1, _over_rows(a1, a3) * i1
-    a2, a3 = _less_column(a2, l21, a1), _less_column(a3, l31, a1)
-    i2 = _over_rows(a2, a2).reciprocal()
-    l32 = _over_rows(a2, a3) * i2
-    a3 = _less_column(a3, l32, a2)
-    d3 = _over_rows(a3, a3)
-    return _to_solve_with(Pivots(i0, i1, i2, d3, l10, l20, l30, l21, l31, l32))
-
-
-def _over_rows(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(dim=-2)
-
-
-def _less_column(a: Tensor, share: Tensor, b: Tensor) -> Tensor:
-    return less(a, share.unsqueeze(-2), b)
-
-
-def shifted_factors(f: Pivots, shift: Tensor) -> Factors:
-    """LDL^T of M - shift from that of M, whose digits it keeps.
-
-    Column by column the difference C of the remainders, at first -shift, is carried along.
-    """
-    i0 = f.i0 / (1 - shift * f.i0)
-    w1, w2, w3 = f.l10 * shift, f.l20 * shift, f.l30 * shift
-    l10, l20, l30 = (torch.addcmul(a, b, i0) for a, b in ((f.l10, w1), (f.l20, w2), (f.l30, w3)))
-    c11, c12, c13 = less(-shift, w1, l10), -w1 * l20, -w1 * l30
-    c22, c23, c33 = less(-shift, w2, l20), -w2 * l30, less(-shift, w3, l30)
-    i1 = f.i1 / (1 + c11 * f.i1)
-    w2, w3 = less(c12, f.l21, c11), less(c13, f.l31, c11)
-    l21, l31 = torch.addcmul(f.l21, w2, i1), torch.addcmul(f.l31, w3, i1)
-    c22 = less(less(c22, f.l21, c12), w2, l21)
-    c23 = less(less(c23, f.l21, c13), w2, l31)
-    c33 = less(less(c33, f.l31, c13), w3, l31)
-    i2 = f.i2 / (1 + c22 * f.i2)
-    w3 = less(c23, f.l32, c22)
-    l32 = torch.addcmul(f.l32, w3, i2)
-    d3 = f.d3 + less(less(c33, f.l32, c23), w3, l32)
-    return _to_solve_with(Pivots(i0, i1, i2, d3, l10, l20, l30, l21, l31, l32))
-
-
 def solve_leading(f: Pivots, b: Vector3) -> Vector3:
     """A^-1 b, A the leading 3x3 block."""
     b0, b1, b2 = b

@@ -16,20 +16,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.chunks import surely_all, values_at_hand
+from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 from deltas_geom.numerics.ldl import (
     Factors,
     Symmetric4,
     Vector4,
     dot,
     factor,
-    factor_columns,
     less,
     multiply,
     rounding,
     scaled,
     shifted,
-    shifted_factors,
     solve_scaled,
     start,
     unit,
@@ -60,7 +58,6 @@ def null_vector(
     accuracy: float = 0.0,
     product: Callable[[Vector4], Vector4] | None = None,
     polish: int = 0,
-    columns: Vector4 | None = None,
 ) -> NullVector:
     """Vector x that minimises x^T M x / x^T x.
 
@@ -70,13 +67,7 @@ def null_vector(
         product: M x, computed more exactly than from M: for M = A^T A, A^T (A x).
         polish: corrections by ``product``, each of which takes the vector from the accuracy that
             M allows nearer to that of A.
-        columns: four ``(*B, R, N)`` of A, whose accuracy the vector then has, whatever M has lost
-            of it. They make polish needless, and cost about three corrections. Where the first
-            three have a null vector of their own the answer may not be finite.
     """
-    if columns is not None:
-        vector, simple = _iterated(matrix)
-        return NullVector(_by_columns(columns, vector), simple)
     if polish > 0 or accuracy < 1e-9 or not values_at_hand(matrix[0]):
         return _iterated(matrix, product=product, polish=polish)
     vector, proved = proved_vector(matrix, accuracy)
@@ -191,24 +182,6 @@ def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4
     along = dot(x, change)
     x0, x1, x2, x3 = (less(x[i], inverse, less(change[i], along, x[i])) for i in range(4))
     return x0, x1, x2, x3
-
-
-def _by_columns(columns: Vector4, x: Vector4) -> Vector4:
-    """The null vector of A from what M makes of it."""
-    factors = factor_columns(columns)
-    # No shift at first: x may be any mixture of vectors that M cannot tell apart, and its
-    # quotient is then near none of their eigenvalues.
-    x = unit(x)
-    near = solve_scaled(factors, x)
-    length = dot(near, near)
-    quotient = factors.pivots.d3 * dot(near, x) / length
-    nearest = shifted_factors(factors.pivots, quotient)
-    zero = torch.zeros_like(quotient)
-    # Vectors closer than 1e-4 span their plane badly, and need it no more.
-    near, quotient = _smaller(
-        nearest, scaled(near, length.rsqrt()), quotient, below=zero, noise=zero, same=1e-8
-    )
-    return solve_scaled(shifted_factors(factors.pivots, quotient), unit(near))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:

@@ -13,12 +13,13 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.checks import batch_shape, check_floating, check_shapes
-from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.chunks import in_chunks
+from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.evaluation import cut_points, recomputed
 from deltas_geom.status import Status
-from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT, check_weights, solver_dtype
+from deltas_geom.triangulation.judge import judge
 from deltas_geom.triangulation.reprojection import parallax_of
 from deltas_geom.triangulation.results import Triangulation
+from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT, check_weights
 
 _Vector = tuple[Tensor, ...]
 """Three components, each of any shape."""
@@ -123,8 +124,8 @@ def _triangulate(
         limit = torch.finfo(dtype).max
         return (*(value.to(dtype).clamp(-limit, limit) for value in found), status)
 
-    cut = ((rays, -2), (weights, -1), (mask, -1))
-    found = in_chunks(solve, solve, cameras, cut, dims=(-2, -1, -1, -1, -1))
+    cut = cut_points(rays, -2, -1, -1, outputs=(-2, -1, -1, -1, -1))
+    found = recomputed(solve, cameras, rays, weights, mask, cut=cut)
     points, depth, residual, parallax, status = found
     valid = status == Status.OK.value
     return Triangulation(points, depth, status, valid, residual, parallax, None)
@@ -287,13 +288,10 @@ def _judge(seen: _Seen, points: _Vector, share: Tensor, dtype: torch.dtype) -> T
     # The law of sines: the spread and the distance, without the point, which may be anywhere.
     near = share * reach > (16 * eps) ** 2 * beside.clamp(min=0)
     near = near & torch.stack(points).to(dtype).isfinite().all(dim=0)
-    status = torch.zeros_like(seen.finite, dtype=torch.int8)
-    for passed, reason in (
-        (_in_front(seen, points), Status.BEHIND_CAMERA),
-        (near, Status.AT_INFINITY),
-        (posed, Status.NO_PARALLAX),
-        (count >= 2, Status.TOO_FEW_VIEWS),
-        (seen.finite, Status.NOT_FINITE_INPUT),
-    ):
-        status = torch.where(passed, status, torch.full_like(status, reason.value))
-    return status
+    return judge(
+        finite=seen.finite,
+        enough=count >= 2,
+        posed=posed,
+        near=near,
+        in_front=_in_front(seen, points),
+    )

@@ -4,132 +4,20 @@ Everything downstream may multiply and divide without asking: what is not used i
 passes no NaN and no gradient.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
-from deltas_geom.numerics.chunks import values_at_hand
-
-# A view whose weight is below this share of the point's largest counts as no view: its squared
-# weight, times a small parallax, would be lost in the rounding of the normal matrix.
-NEGLIGIBLE_WEIGHT = 1e-6
-
+from deltas_geom.checks import check_floating, check_shapes
+from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
+from deltas_geom.numerics.evaluation import serial_points
+from deltas_geom.numerics.sums import product
+from deltas_geom.triangulation.weights import Weights, check_weights, weigh
 
 Vector3 = tuple[Tensor, Tensor, Tensor]
 """Components of vectors: struct of arrays, which is fast and compiles into one loop."""
-
-
-def over_views(coefficients: Tensor, values: Tensor) -> tuple[Tensor, ...]:
-    """For K coefficients ``(*B, K, V)`` of views, K sums ``(*B, N)`` of values ``(*B, V, N)``."""
-    if torch.compiler.is_compiling():
-        sums: tuple[Tensor, ...] = _FusedSums.apply(coefficients, values)  # type: ignore[no-untyped-call]
-        return sums
-    return (coefficients @ values).unbind(dim=-2)
-
-
-class _FusedSums(torch.autograd.Function):
-    """The product element by element, which a compiler fuses with what stands around it.
-
-    Its derivative by the coefficients is a sum over points, for which a product is better.
-    """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(coefficients: Tensor, values: Tensor) -> tuple[Tensor, ...]:
-        return tuple(_sum_of(row, values) for row in coefficients.unbind(dim=-2))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        coefficients, values = ctx.saved_tensors
-        gradient = torch.stack(gradients, dim=-2)
-        of_coefficients = of_values = None
-        if ctx.needs_input_grad[0]:
-            of_coefficients = (gradient @ values.mT).sum_to_size(coefficients.shape)
-        if ctx.needs_input_grad[1]:
-            columns = coefficients.unbind(dim=-1)
-            of_values = torch.stack([_sum_of(column, gradient) for column in columns], dim=-2)
-            of_values = of_values.sum_to_size(values.shape)
-        return of_coefficients, of_values
-
-
-def _sum_of(row: Tensor, values: Tensor) -> Tensor:
-    total = row[..., 0, None] * values[..., 0, :]
-    for view in range(1, values.shape[-2]):
-        total = total + row[..., view, None] * values[..., view, :]
-    return total
-
-
-class Weights(NamedTuple):
-    """How much each view counts for each point.
-
-    They are those of one point, N = 1, where all points are alike.
-
-    Attributes:
-        squared: ``(*B, V, N)`` squared weights, a point's largest 1; 0 where unused. 0 or
-            anything where unsound, which makes the point fail.
-        largest: ``(*B, 1, N)`` a point's largest weight; 1 if that is 0.
-        unused: ``(*B, V, N)`` bool.
-        used: ``(*B, V, N)`` its complement as 1 and 0, to be summed.
-        sound: ``(*B, N)`` bool: every used weight is finite, and what it weighs is sound.
-    """
-
-    squared: Tensor
-    largest: Tensor
-    unused: Tensor
-    used: Tensor
-    sound: Tensor
-
-
-def weigh(
-    weights: Tensor | None, mask: Tensor | None, *, batch: torch.Size, like: Tensor, sound: Tensor
-) -> Weights:
-    """Tell used views from unused ones.
-
-    Args:
-        weights: ``(*B, V, N)`` or None for all 1. 0 = unused; the sign has no effect. NaN counts
-            as used.
-        mask: ``(*B, V, N)`` bool or None, True = used.
-        batch: dims to which all are expanded.
-        like: ``(*B, V, N, ...)`` of what is weighed.
-        sound: ``(*B, V, N)`` bool: it can be used.
-    """
-    work = solver_dtype(like)
-    weight = like.new_ones((), dtype=work) if weights is None else weights.to(work)
-    if mask is not None:
-        weight = torch.where(mask, weight, 0.0)
-    alike = weights is None and mask is None
-    weight = weight.expand(*batch, like.shape[-3], 1 if alike else like.shape[-2])
-    size = weight.detach().abs()
-    largest = size.amax(dim=-2, keepdim=True)
-    unused = size <= NEGLIGIBLE_WEIGHT * largest
-    counted = largest <= torch.finfo(work).max  # NaN is not, either
-    one, zero = weight.new_ones(()), weight.new_zeros(())
-    largest = torch.where(counted & (largest > 0), largest, one)
-    # Double where: an infinite weight must not turn the gradient into NaN.
-    share = torch.where(counted, weight, zero) / largest
-    # What is not sound makes its point fail, if it is used: it need not be told from point to
-    # point where all are alike.
-    counts = ~unused if alike else sound & ~unused
-    return Weights(
-        squared=torch.where(counts, share * share, zero),
-        largest=largest,
-        unused=unused,
-        used=(~unused).to(work),
-        sound=(sound | unused).all(dim=-2) & counted.squeeze(-2),
-    )
-
-
-def alike_weights(proj: Tensor) -> Weights:
-    """Those of one point for all that are seen by cameras ``(*B, V, 3, 4)`` and weigh the same."""
-    like = proj[..., :1, 0]
-    return weigh(None, None, batch=proj.shape[:-3], like=like[..., None], sound=like == like)
 
 
 class Cameras(NamedTuple):
@@ -137,12 +25,12 @@ class Cameras(NamedTuple):
 
     Attributes:
         proj: ``(*B, V, 3, 4)``, 0 for cameras that are not finite.
-        sick: ``(*B, V)`` 1 for those, else 0.
+        broken: ``(*B, V)`` 1 for those, else 0.
         centers: ``(*B, V, 3)``, see :func:`projection_centers`.
     """
 
     proj: Tensor
-    sick: Tensor
+    broken: Tensor
     centers: Tensor
 
 
@@ -150,10 +38,12 @@ def cameras_of(proj: Tensor) -> Cameras:
     """Tell finite cameras ``(*B, V, 3, 4)`` from others."""
     check_shapes(proj=(proj, "+V 3 4"))
     work = solver_dtype(proj)
+    clean = proj.to(work)
     limit = torch.finfo(work).max ** 0.25
-    finite = (proj.detach().to(work).abs() < limit).all(-1).all(-1)
-    # Double where: what is not used must pass no gradient and no NaN.
-    clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
+    finite = clean.detach().abs().amax(dim=(-2, -1)) < limit  # NaN is not below
+    if not surely_all(finite):
+        # Double where: what is not used must pass no gradient and no NaN.
+        clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
     return Cameras(clean, (~finite).to(work), projection_centers(clean))
 
 
@@ -161,71 +51,76 @@ class Observations(NamedTuple):
     """Pixels of N points in V views.
 
     Attributes:
-        proj: ``(*B, V, 3, 4)``, 0 for cameras that are not finite.
-        sick: ``(*B, V)`` 1 for those, else 0.
-        xy: ``(*B, V, 2, N)`` pixels, 0 where unused or not finite.
+        x: ``(*B, V, N)`` px, 0 where not finite.
+        y: ``(*B, V, N)`` px, likewise.
         weights: of the pixels.
     """
 
-    proj: Tensor
-    sick: Tensor
-    xy: Tensor
+    x: Tensor
+    y: Tensor
     weights: Weights
 
 
 def observe(
-    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+    pixels: Tensor, weights: Tensor | None, mask: Tensor | None, batch: torch.Size
 ) -> Observations:
-    """Check shapes, broadcast, and tell used from unused.
+    """Broadcast, and tell used from unused.
 
     Args:
-        proj: ``(*B, V, 3, 4)``.
         pixels: ``(*B, V, N, 2)``; those of unused views may hold anything.
-        weights: see :func:`weigh`.
-        mask: see :func:`weigh`.
-
-    Raises:
-        ShapeError: a trailing shape differs, or there is no view.
-        TypeError: the mask is not bool.
+        weights: see :func:`deltas_geom.triangulation.weights.weigh`.
+        mask: see there.
+        batch: of the cameras, pixels, weights and mask together.
     """
-    cameras = cameras_of(proj)
-    xy, weighed = weigh_pixels(cameras, pixels, weights, mask)
-    return Observations(cameras.proj, cameras.sick, xy, weighed)
+    x, y, sound = clean_pixels(pixels)
+    return Observations(x, y, weigh(weights, mask, batch=batch, like=pixels, sound=sound))
 
 
-def weigh_pixels(
-    cameras: Cameras, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> tuple[Tensor, Weights]:
-    """The pixels and weights of :func:`observe`."""
-    batch = check_pixels(cameras, pixels, weights, mask)
-    xy, sound = clean_pixels(pixels)
-    return xy, weigh(weights, mask, batch=batch, like=pixels, sound=sound)
+def in_parts(
+    pixels: Tensor, weights: Tensor | None, mask: Tensor | None, batch: torch.Size
+) -> list[Observations]:
+    """:func:`observe`, so few points at a time that no operation on their views starts threads."""
+    # Who derives the operations, or compiles them, wants them once.
+    if torch.compiler.is_compiling() or torch.is_grad_enabled():
+        return [observe(pixels, weights, mask, batch)]
+    count, few = pixels.shape[-2], serial_points(pixels)
+    if count <= few:
+        return [observe(pixels, weights, mask, batch)]
+    parts: list[Observations] = []
+    for start in range(0, count, few):
+        end = start + few
+        if parts and weights is None and mask is None:
+            x, y, sound = clean_pixels(pixels[..., start:end, :])
+            if sound is None and parts[0].weights.squared.shape[-1] == 1:
+                parts.append(Observations(x, y, parts[0].weights))
+                continue
+        parts.append(
+            observe(
+                pixels[..., start:end, :],
+                None if weights is None else weights[..., start:end],
+                None if mask is None else mask[..., start:end],
+                batch,
+            )
+        )
+    return parts
 
 
-def check_pixels(
-    cameras: Cameras, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
-) -> torch.Size:
-    """:func:`check_observed` by cameras that are cleaned already."""
-    return check_observed(cameras.proj, pixels, weights, mask)
+def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """x and y of pixels ``(*B, V, N, 2)``, 0 where not finite, and which are finite.
 
-
-def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels ``(*B, V, 2, N)`` of the solver's type, 0 where not finite, and which are finite.
-
-    These are bool, ``(*B, V, N)``, or of one point for all.
+    Each ``(*B, V, N)``, in the solver's type; instead of the last, None where all are known to be.
     """
     # Struct of arrays: sums over views then run over memory in order.
     work = solver_dtype(pixels)
-    xy = pixels.mT.to(work, memory_format=torch.contiguous_format).contiguous()
-    limit = torch.finfo(work).max ** 0.25  # what is beyond overflows; NaN is not below
-    if values_at_hand(pixels):
-        every = xy.detach().flatten()
-        if bool(every.dot(every) < limit):
-            return xy, torch.ones_like(pixels[..., :1, 0], dtype=torch.bool)
-    x, y = xy.detach().unbind(dim=-2)
-    sound = torch.addcmul(x * x, y, y) < limit
+    x, y = (one.to(work, memory_format=torch.contiguous_format) for one in pixels.unbind(dim=-1))
+    limit = torch.finfo(work).max ** 0.125  # squares of what is beyond overflow
+    if values_at_hand(pixels) and pixels.numel():
+        known = [float(end) for one in (x, y) for end in torch.aminmax(one.detach())]
+        if all(-limit < end < limit for end in known):  # NaN is not
+            return x.contiguous(), y.contiguous(), None
+    sound = torch.maximum(x.detach().abs(), y.detach().abs()) < limit  # NaN is not below
     # Double where: what is not used must pass no gradient and no NaN.
-    return torch.where(sound.unsqueeze(-2), xy, xy.new_zeros(())), sound
+    return torch.where(sound, x, 0.0), torch.where(sound, y, 0.0), sound
 
 
 def check_observed(
@@ -237,34 +132,6 @@ def check_observed(
     return check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
 
 
-def check_weights(
-    weights: Tensor | None,
-    mask: Tensor | None,
-    name: str,
-    seen: Tensor,
-    dims: str,
-    batch: torch.Size,
-) -> torch.Size:
-    """Raise unless weights and mask ``(*B, V, N)`` fit what is weighed, and the mask is bool.
-
-    Returns:
-        The batch dims to which all broadcast.
-    """
-    shapes = [batch, seen.shape[:-3]]
-    for label, tensor in (("weights", weights), ("mask", mask)):
-        if tensor is not None:
-            check_shapes(**{name: (seen, dims), label: (tensor, "V N")})
-            shapes.append(tensor.shape[:-2])
-    check_bool(mask=mask)
-    return batch_shape(*shapes)
-
-
-def solver_dtype(tensor: Tensor) -> torch.dtype:
-    """The type to compute in: float64, whatever the input, where the device has it."""
-    # Apple's devices have no float64; there the rig frame alone keeps float32 usable.
-    return torch.float32 if tensor.device.type == "mps" else torch.float64
-
-
 def projection_centers(proj: Tensor) -> Tensor:
     """Centres ``(*B, V, 3)`` of cameras ``(*B, V, 3, 4)``.
 
@@ -272,16 +139,43 @@ def projection_centers(proj: Tensor) -> Tensor:
 
     Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
     """
-    rows = proj[..., :3]
-    r0, r1, r2 = rows.unbind(dim=-2)
-    cofactors = torch.stack(
-        [torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)], dim=-2
-    )
-    determinant = (r0 * cofactors[..., 0, :]).sum(dim=-1)
+    cofactors, inverse = inverted(proj[..., :3])
+    return -inverse[..., None] * (cofactors * proj[..., 3:]).sum(dim=-2)
+
+
+def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Cofactors ``(*B, 3, 3)``, whose transpose by the determinant is the inverse, and 1 by that.
+
+    Both are 0, with zero gradient, where the matrix is singular within rounding.
+    """
+    cofactors = torch.linalg.cross(matrix.roll(-1, dims=-2), matrix.roll(-2, dims=-2))
+    determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(dim=-1)
     with torch.no_grad():
-        product = rows.square().sum(dim=-1).prod(dim=-1).sqrt()
-        exists = determinant.abs() > 4 * torch.finfo(proj.dtype).eps * product
+        product = torch.linalg.vector_norm(matrix, dim=-1).prod(dim=-1)
+        exists = determinant.abs() > 4 * torch.finfo(matrix.dtype).eps * product
+    if surely_all(exists):
+        return cofactors, determinant.reciprocal()
     # Double where: a singular camera must not turn the gradient into NaN.
-    inverse = 1 / torch.where(exists, determinant, 1.0)
-    position = torch.where(exists[..., None], proj[..., 3], 0.0)
-    return -inverse[..., None] * (cofactors * position[..., None]).sum(dim=-2)
+    inverse = torch.where(exists, 1 / torch.where(exists, determinant, 1.0), 0.0)
+    return torch.where(exists[..., None, None], cofactors, 0.0), inverse
+
+
+def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """P X of cameras ``(*B, V, 3, 4)`` and homogeneous points four ``(*B, N)``.
+
+    Three ``(*B, V, N)``.
+    """
+    if torch.compiler.is_compiling():
+        seen = (_linear(row, places) for row in proj.unbind(dim=-2))
+    else:
+        rows = proj.transpose(-3, -2).flatten(-3, -2)  # all of p1, all of p2, all of p3
+        seen = product(rows, torch.stack(tuple(places), dim=-2)).chunk(3, dim=-2)
+    a, b, c = seen
+    return a, b, c
+
+
+def _linear(row: Tensor, values: Sequence[Tensor]) -> Tensor:
+    """Row by row, which a compiler fuses with what stands around it."""
+    factors = row.unsqueeze(-1).unbind(dim=-2)
+    parts = [f * value.unsqueeze(-2) for f, value in zip(factors, values, strict=True)]
+    return sum(parts[1:], parts[0])

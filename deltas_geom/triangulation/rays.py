@@ -14,29 +14,29 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.checks import check_floating, check_shapes
-from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.chunks import in_chunks
+from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.evaluation import cut_points, recomputed
 from deltas_geom.numerics.ldl import Symmetric4, Vector4
 from deltas_geom.status import Status
-from deltas_geom.triangulation.observed import (
-    Vector3,
-    Weights,
-    check_weights,
-    solver_dtype,
-    weigh,
-)
+from deltas_geom.triangulation.judge import judge, ok
+from deltas_geom.triangulation.observed import Vector3
 from deltas_geom.triangulation.reprojection import parallax_of
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.rig_frame import (
-    FoundPoints,
     RigFrame,
+    camera_moments,
+    datum_of,
+    rig_frame,
+    rig_sums,
+)
+from deltas_geom.triangulation.solution import (
+    FoundPoints,
     derivable_points,
     find_points,
     in_world,
-    judge_points,
     kept,
-    rig_frames,
 )
+from deltas_geom.triangulation.weights import Weights, check_weights, weigh
 
 
 @without_autocast
@@ -101,7 +101,7 @@ def triangulate_rays(
     def values(*inputs: Tensor) -> tuple[Tensor, ...]:
         posed = _pose(*inputs)
         found, status = _find(posed)
-        points = kept(found.points, posed.around, status == Status.OK.value)
+        points = kept(in_world(found.points, posed.datum), ok(status))
         return known(posed.seen, points, status)
 
     def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -109,11 +109,10 @@ def triangulate_rays(
         found, status = _find(posed)
         valid = status == Status.OK.value
         near = derivable_points(posed.normal, posed.frame, found.vector, valid)
-        return known(posed.seen, kept(near, posed.around, valid), status)
+        return known(posed.seen, kept(in_world(near, posed.datum), valid), status)
 
-    cut = ((rays, -2), (weights, -1), (mask, -1))
-    dims = (-2, -1, -1, -1, -1)
-    found = in_chunks(derivable, values, cam_from_world, cut, dims=dims)
+    cut = cut_points(rays, -2, -1, -1, outputs=(-2, -1, -1, -1, -1))
+    found = recomputed(derivable, cam_from_world, rays, weights, mask, values=values, cut=cut)
     points, depth, residual, parallax, status = found
     valid = status == Status.OK.value
     return Triangulation(points, depth, status, valid, residual, parallax, None)
@@ -124,13 +123,13 @@ class _Seen(NamedTuple):
 
     Attributes:
         centers: ``(*B, V, 3)`` of the cameras.
-        sick: ``(*B, V)`` 1 for cameras that are not finite, else 0.
+        broken: ``(*B, V)`` 1 for cameras that are not finite, else 0.
         directions: ``(*B, V, 3, N)`` unit, in the world; anything where unsound.
         weights: of the rays.
     """
 
     centers: Tensor
-    sick: Tensor
+    broken: Tensor
     directions: Tensor
     weights: Weights
 
@@ -157,7 +156,7 @@ def _see(
     squared = direction.square().sum(dim=-2, keepdim=True)
     return _Seen(
         centers=camera_centers(pose),
-        sick=(~finite).to(work),
+        broken=(~finite).to(work),
         directions=direction * torch.where(squared > 0, squared, 1.0).rsqrt(),
         weights=weigh(weights, mask, batch=batch, like=rays, sound=sound),
     )
@@ -168,7 +167,7 @@ class _Posed(NamedTuple):
 
     Attributes:
         seen: the rays.
-        around: ``(*B, 1, 3)`` the origin of the sums, in the world.
+        datum: ``(*B, 1, 3)`` the origin of the sums, in the world.
         offset: ``(*B, V, 3, N)`` of the frame's origin from the centres, in its units.
         frame: of the points.
         normal: ten ``(*B, N)``, in the frame.
@@ -176,7 +175,7 @@ class _Posed(NamedTuple):
     """
 
     seen: _Seen
-    around: Tensor
+    datum: Tensor
     offset: Tensor
     frame: RigFrame
     normal: Symmetric4
@@ -188,12 +187,15 @@ def _pose(
 ) -> _Posed:
     seen = _see(cam_from_world, rays, weights, mask)
     eps = torch.finfo(rays.dtype).eps
-    around, frame = rig_frames(seen.centers, seen.weights, seen.sick, eps=eps)
-    centers = (seen.centers - around)[..., None]
+    datum = datum_of(seen.centers)
+    moments = camera_moments(seen.centers, datum, seen.broken)
+    frame = rig_frame(*rig_sums(moments, seen.weights), eps=eps)
+    frame = frame._replace(finite=frame.finite & seen.weights.sound)
+    centers = (seen.centers - datum)[..., None]
     origin = torch.stack(frame.origin, dim=-2).unsqueeze(-3)
     offset = (origin - centers) / frame.unit.unsqueeze(-2).unsqueeze(-3)
     normal = _normal_matrix(seen.directions, offset, seen.weights.squared)
-    return _Posed(seen, around, offset, frame, normal, rays.dtype)
+    return _Posed(seen, datum, offset, frame, normal, rays.dtype)
 
 
 def _normal_matrix(directions: Tensor, offset: Tensor, squared: Tensor) -> Symmetric4:
@@ -224,7 +226,7 @@ def _find(posed: _Posed) -> tuple[FoundPoints, Tensor]:
     polish = 2 if posed.dtype == torch.float64 else 0
     eps = torch.finfo(posed.dtype).eps
     found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = in_world(found.points, posed.around)
+    x, y, z = in_world(found.points, posed.datum)
     along = _along(posed.seen, (x, y, z))
     # At a camera's centre, within rounding, a point has no angle.
     size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()).unsqueeze(-2)
@@ -232,7 +234,14 @@ def _find(posed: _Posed) -> tuple[FoundPoints, Tensor]:
     ahead = along - 64 * torch.finfo(along.dtype).eps * size
     in_front = torch.where(posed.seen.weights.unused, 1.0, ahead).amin(dim=-2) > 0
     held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
-    status = judge_points(found, posed.frame, in_front=in_front, representable=held)
+    frame = posed.frame
+    status = judge(
+        finite=frame.finite,
+        enough=frame.enough,
+        posed=found.posed,
+        near=found.near & held,
+        in_front=in_front,
+    )
     return found, status
 
 

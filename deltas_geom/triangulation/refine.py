@@ -14,22 +14,13 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.checks import batch_shape, check_floating, check_shapes
 from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.chunks import in_chunks
-from deltas_geom.triangulation.dlt import (
-    Symmetric3,
-    normal_matrix,
-    second_derivative,
-    solve3_scaled,
-)
-from deltas_geom.triangulation.observed import (
-    Observations,
-    Vector3,
-    check_weights,
-    observe,
-    over_views,
-)
-
-Loss = Literal["squared", "huber", "cauchy"]
+from deltas_geom.numerics.evaluation import cut_points, recomputed
+from deltas_geom.numerics.sums import over_views
+from deltas_geom.numerics.symmetric3 import Symmetric3, solve3_scaled
+from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
+from deltas_geom.triangulation.observed import Observations, Vector3, cameras_of, observe
+from deltas_geom.triangulation.robust_loss import Loss, robust_loss, second_derivative
+from deltas_geom.triangulation.weights import check_weights
 
 _Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
@@ -127,39 +118,29 @@ def refine_points(
         raise ValueError(f"scale must be positive, got {scale}")
 
     def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:
-        problem = _pose(partial(_robust, loss, scale), *inputs)
+        problem = _pose(partial(robust_loss, loss, scale), *inputs)
         return _outward(problem, *descend(problem, steps), dtype=points.dtype)
 
     unrolled, implicit = partial(refined, _descend), partial(refined, _descend_implicitly)
     derivable = unrolled if gradient == "unrolled" else implicit
-    known = ((pixels, -2), (points, -2), (weights, -1), (mask, -1))
-    return Refined(*in_chunks(derivable, unrolled, proj, known, dims=(-2, -1, -1)))
-
-
-def _robust(loss: Loss, scale: float, squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """rho of squared distances s, px^2 (near 0 it is s), its influence rho', and 2 rho''."""
-    if loss == "squared":
-        return squared, squared.new_ones(()), squared.new_zeros(())
-    ratio = squared / scale**2
-    if loss == "cauchy":
-        slope = 1 / (1 + ratio)
-        return scale**2 * ratio.log1p(), slope, -2 * slope.square() / scale**2
-    far, slope = ratio > 1, ratio.clamp(min=1).rsqrt()
-    rho = torch.where(far, scale**2 * (2 / slope - 1), squared)
-    return rho, slope, torch.where(far, slope**3 / -(scale**2), 0.0)
+    cut = cut_points(pixels, -2, -2, -1, -1, outputs=(-2, -1, -1))
+    known = (proj, pixels, points, weights, mask)
+    return Refined(*recomputed(derivable, *known, values=unrolled, cut=cut))
 
 
 class _Problem(NamedTuple):
     """What is to be minimised, and from where.
 
     Attributes:
-        observed: cameras, pixels and weights.
-        robust: the loss, see :func:`_robust`.
+        proj: ``(*B, V, 3, 4)`` of the cameras.
+        observed: pixels and weights.
+        robust: the loss, see :func:`robust_loss`.
         start: ``(*B, 3, N)`` m; 0 where not finite.
         sound: ``(*B, N)`` bool: finite, and two or more views are used.
         limit: m, where points stop to be representable.
     """
 
+    proj: Tensor
     observed: Observations
     robust: _Loss
     start: Tensor
@@ -170,15 +151,19 @@ class _Problem(NamedTuple):
 def _pose(
     robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Tensor | None
 ) -> _Problem:
-    observed = observe(proj, pixels, *weighed)
-    place = points.mT.to(observed.xy.dtype).contiguous()
+    cameras = cameras_of(proj)
+    batch = check_weights(*weighed, "pixels", pixels, "V N 2", proj.shape[:-3])
+    observed = observe(pixels, *weighed, batch)
+    place = points.mT.to(observed.x.dtype).contiguous()
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
     start = torch.where(finite.unsqueeze(-2), place, place.new_zeros(()))
-    # One sick view outweighs all that are used, so that one sum tells both.
-    counted = observed.weights.used * (1 - proj.shape[-3] * observed.sick).unsqueeze(-1)
+    # One broken view outweighs all that are used, so that one sum tells both.
+    counted = observed.weights.used * (1 - proj.shape[-3] * cameras.broken).unsqueeze(-1)
     sound = observed.weights.sound & finite & (counted.sum(dim=-2) >= 2)
-    return _Problem(observed, robust, start, sound, min(limit, torch.finfo(points.dtype).max))
+    return _Problem(
+        cameras.proj, observed, robust, start, sound, min(limit, torch.finfo(points.dtype).max)
+    )
 
 
 class _Fit(NamedTuple):
@@ -205,7 +190,7 @@ class _Fit(NamedTuple):
 
 def _fit(problem: _Problem, points: Vector3) -> _Fit:
     observed = problem.observed
-    rows = observed.proj.transpose(-3, -2).flatten(-3, -2)  # (*B, 3 V, 4)
+    rows = problem.proj.transpose(-3, -2).flatten(-3, -2)  # (*B, 3 V, 4)
     homogeneous = rows @ torch.stack([*points, torch.ones_like(points[0])], dim=-2)
     a, b, c = homogeneous.chunk(3, dim=-2)
     with torch.no_grad():
@@ -213,7 +198,7 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
         smallest = torch.finfo(c.dtype).tiny ** (1 / 6)
         least = (torch.maximum(a.abs(), b.abs()) * (1 / _FARTHEST)).clamp(min=smallest)
     depth = torch.maximum(c, least)
-    inverse, (px, py) = depth.reciprocal(), observed.xy.unbind(dim=-2)
+    inverse, (px, py) = depth.reciprocal(), (observed.x, observed.y)
     x, y = a * inverse, b * inverse
     dx, dy = x - px, y - py
     distance = torch.addcmul(dx * dx, dy, dy)
@@ -253,7 +238,7 @@ def _descend(problem: _Problem, steps: int) -> _End:
 def _rounding(problem: _Problem, fit: _Fit) -> Tensor:
     """What rounding of the projections may cost a perfect match, ``(*B, N)`` px^2."""
     by_depth = problem.observed.weights.squared * fit.inverse * fit.inverse
-    size = problem.observed.proj[..., :2, :].square().sum(dim=-2)  # of the rows
+    size = problem.proj[..., :2, :].square().sum(dim=-2)  # of the rows
     turned, shifted = size[..., :3].sum(dim=-1, keepdim=True), size[..., 3:]
     reach = problem.start.square().sum(dim=-2, keepdim=True)
     squared = (torch.addcmul(shifted, turned, reach) * by_depth).sum(dim=-2)
@@ -263,10 +248,12 @@ def _rounding(problem: _Problem, fit: _Fit) -> Tensor:
 
 def _normal_equations(problem: _Problem, fit: _Fit) -> tuple[Symmetric3, Vector3]:
     """J^T W^2 J and -J^T W^2 e of the re-weighted views, e the distances."""
-    directions, (x, y), (dx, dy) = problem.observed.proj[..., :3], fit.place, fit.offset
+    directions, (x, y), (dx, dy) = problem.proj[..., :3], fit.place, fit.offset
     once = problem.observed.weights.squared * fit.influence * fit.inverse
     # The derivative of a pixel by the point is its equations, divided by the depth.
-    m00, m01, m02, m11, m12, m22 = normal_matrix(directions, x, y, once * fit.inverse)
+    m00, m01, m02, m11, m12, m22 = normal_matrix(
+        normal_coefficients(directions), x, y, once * fit.inverse
+    )
     across, down = dx * once, dy * once
     terms = torch.stack([across, down, torch.addcmul(across * x, down, y)], dim=-2)
     rows = torch.cat([-directions[..., :2, :], directions[..., 2:, :]], dim=-2).flatten(-3, -2)
@@ -288,7 +275,7 @@ def _descend_implicitly(problem: _Problem, steps: int) -> _End:
     seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
     with torch.no_grad():
         counted = squared * fit.influence, squared * fit.bend
-        hessian = second_derivative(normal, problem.observed.proj, *seen, *counted)
+        hessian = second_derivative(normal, problem.proj, *seen, *counted)
     h00, h01, h02, h11, h12, h22 = (entry.detach() for entry in hessian)
     change, strict = solve3_scaled((h00, h01, h02, h11, h12, h22), right)
     px, py, pz = (

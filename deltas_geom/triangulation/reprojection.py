@@ -1,12 +1,14 @@
 """Points as views see them again: projections, distances from pixels, angles between rays."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.triangulation.observed import Vector3, homogeneous_in_views
 
 
 class Reprojection(NamedTuple):
@@ -29,18 +31,18 @@ class Reprojection(NamedTuple):
 
 def reproject(proj: Tensor, points: Vector3, used: Tensor) -> Reprojection:
     """Project finite points, three ``(*B, N)``, into the used views ``(*B, V, N)``."""
-    x, y, z = (in_views(proj[..., row, :], points) for row in range(3))
+    x, y, z = homogeneous_in_views(proj, (*points, torch.ones_like(points[0])))
     info = torch.finfo(z.dtype)
     with torch.no_grad():
         # Far above the smallest number, so that squares of the inverse are finite.
         seen = used & (z > info.tiny**0.25)
         # Projections so far out that products of their squares overflow are beside the camera.
         seen = seen & (torch.maximum(x.abs(), y.abs()) < info.max**0.2 * z)
-    inverse = safe_divide(torch.ones_like(z), z, seen)
+    inverse = z.reciprocal() if surely_all(seen) else safe_divide(torch.ones_like(z), z, seen)
     return Reprojection(x * inverse, y * inverse, inverse, z, seen)
 
 
-def in_views(row: Tensor, points: Vector3) -> Tensor:
+def in_views(row: Tensor, points: Sequence[Tensor]) -> Tensor:
     """A row ``(*B, V, 4)`` of each camera times points, three ``(*B, N)``: ``(*B, V, N)``."""
     total = row[..., 3:]
     for axis, component in enumerate(points):
@@ -48,13 +50,13 @@ def in_views(row: Tensor, points: Vector3) -> Tensor:
     return total
 
 
-def residual_of(found: Reprojection, xy: Tensor, squared: Tensor) -> Tensor:
-    """Weighted RMS distance ``(*B, N)`` px from ``xy``: ``(*B, V, 2, N)``."""
-    x, y = xy.unbind(dim=-2)
-    # Scaled before it is squared: projections may lie anywhere.
-    dx, dy = torch.where(found.seen, found.x - x, 0.0), torch.where(found.seen, found.y - y, 0.0)
-    squared = torch.where(found.seen, squared, 0.0)
-    errors = ((dx * dx + dy * dy) * squared).sum(dim=-2)
+def residual_of(found: Reprojection, x: Tensor, y: Tensor, squared: Tensor) -> Tensor:
+    """Weighted RMS distance ``(*B, N)`` px from pixels, x and y ``(*B, V, N)``."""
+    dx, dy = found.x - x, found.y - y
+    if not surely_all(found.seen):
+        dx, dy = torch.where(found.seen, dx, 0.0), torch.where(found.seen, dy, 0.0)
+        squared = torch.where(found.seen, squared, 0.0)
+    errors = (torch.addcmul(dx * dx, dy, dy) * squared).sum(dim=-2)
     total = squared.sum(dim=-2)
     mean = safe_divide(errors, total, total > 0)
     return safe_sqrt(mean)
@@ -76,12 +78,14 @@ def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
     tiny = torch.finfo(x.dtype).tiny ** 0.5
     inverse = torch.rsqrt(torch.addcmul(torch.addcmul(x * x, y, y), z, z).clamp(min=tiny))
     x, y, z = x * inverse, y * inverse, z * inverse
-    chord = torch.zeros_like(used[..., 0, :])
-    for first in range(used.shape[-2] - 1):
+    chord = torch.zeros_like(x[..., 0, :])
+    everywhere = surely_all(used > 0)
+    for first in range(x.shape[-2] - 1):
         one, rest = slice(first, first + 1), slice(first + 1, None)
         dx, dy, dz = (t[..., one, :] - t[..., rest, :] for t in (x, y, z))
         apart = torch.addcmul(torch.addcmul(dx * dx, dy, dy), dz, dz)
-        both = used[..., one, :] * used[..., rest, :]
-        chord = torch.maximum(chord, (apart * both).amax(dim=-2))
+        if not everywhere:
+            apart = apart * (used[..., one, :] * used[..., rest, :])
+        chord = torch.maximum(chord, apart.amax(dim=-2))
     # The chord keeps small angles that the arc cosine of a dot product rounds away.
     return 2 * torch.asin((0.5 * chord.sqrt()).clamp(max=1))

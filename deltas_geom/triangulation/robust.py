@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import to_homogeneous
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
 from deltas_geom.status import Status
-from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT, check_observed, solver_dtype
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.results import RobustTriangulation
 from deltas_geom.triangulation.triangulate import triangulate, triangulate_points
+from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 _BUDGET = 2**17  # distances at a time: what lies between stays in the cache
 
@@ -96,7 +97,7 @@ def triangulate_robust(
     found = triangulate(proj, pixels, weights, inliers, covariance=covariance)
     status = torch.where(inliers.any(dim=-2), found.status, reason)
     inliers = inliers & found.valid.unsqueeze(-2)
-    return RobustTriangulation(*found._replace(status=status), inliers)
+    return RobustTriangulation(**found._replace(status=status)._asdict(), inliers=inliers)
 
 
 class _Observations(NamedTuple):

@@ -5,9 +5,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.arithmetic import solver_dtype
 from deltas_geom.numerics.ldl import Symmetric4
-from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT, projection_centers, solver_dtype
+from deltas_geom.triangulation.observed import projection_centers
 from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame
+from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 
 class Listed(NamedTuple):
@@ -38,7 +40,7 @@ class PosedTracks(NamedTuple):
     Attributes:
         listed: the observations.
         rows: x p3 - p1 and y p3 - p2 in the frame, each four ``(T)``.
-        around: ``(1, 3)`` the origin of the sums, in the world.
+        datum: ``(1, 3)`` the origin of the sums, in the world.
         frame: of the points.
         normal: ten ``(N)``, in the frame.
         dtype: of the inputs.
@@ -46,7 +48,7 @@ class PosedTracks(NamedTuple):
 
     listed: Listed
     rows: tuple[Tensor, Tensor]
-    around: Tensor
+    datum: Tensor
     frame: RigFrame
     normal: Symmetric4
     dtype: torch.dtype
@@ -78,8 +80,8 @@ def pose_tracks(
 
     centers = projection_centers(camera)
     # Of all cameras alike: those that see nothing do no harm beyond rounding.
-    around = centers.detach().mean(dim=0, keepdim=True)
-    weighted, counted = camera_moments(centers, around, (~finite).to(work))
+    datum = centers.detach().mean(dim=0, keepdim=True)
+    weighted, counted = camera_moments(centers, datum, (~finite).to(work))
     frame = rig_frame(
         summed(at(weighted, camera_index) * listed.squared, point_index, num_points).unbind(),
         summed(
@@ -88,13 +90,13 @@ def pose_tracks(
         eps=torch.finfo(proj.dtype).eps,
     )
     frame = frame._replace(finite=frame.finite & listed.sound)
-    origin = at(torch.stack(frame.origin), point_index) + around.mT
+    origin = at(torch.stack(frame.origin), point_index) + datum.mT
     unit = at(frame.unit, point_index)
     moved = ((listed.camera[:, :3] * origin).sum(dim=1) + listed.camera[:, 3]) / unit
     p1, p2, p3 = torch.cat([listed.camera[:, :3], moved[:, None]], dim=1)  # each (4, T)
     rows = listed.x * p3 - p1, listed.y * p3 - p2
     normal = _normal_matrix(rows, listed.squared, point_index, num_points)
-    return PosedTracks(listed, rows, around, frame, normal, proj.dtype)
+    return PosedTracks(listed, rows, datum, frame, normal, proj.dtype)
 
 
 def _listed(

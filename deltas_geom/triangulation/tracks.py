@@ -15,13 +15,13 @@ from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.numerics.ldl import Vector4
 from deltas_geom.status import Status
+from deltas_geom.triangulation.judge import judge, ok
 from deltas_geom.triangulation.observed import Vector3
-from deltas_geom.triangulation.rig_frame import (
+from deltas_geom.triangulation.solution import (
     FoundPoints,
     derivable_points,
     find_points,
     in_world,
-    judge_points,
     kept,
 )
 from deltas_geom.triangulation.track_equations import (
@@ -149,7 +149,7 @@ def triangulate_tracks(
     def values(*inputs: Tensor) -> tuple[Tensor, ...]:
         posed = pose_tracks(*inputs, num_points=num_points)
         found, status = _find(posed)
-        points = kept(found.points, posed.around, status == Status.OK.value)
+        points = kept(in_world(found.points, posed.datum), ok(status))
         return known(posed, points, status)
 
     def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -157,7 +157,7 @@ def triangulate_tracks(
         found, status = _find(posed)
         valid = status == Status.OK.value
         near = derivable_points(posed.normal, posed.frame, found.vector, valid)
-        return known(posed, kept(near, posed.around, valid), status)
+        return known(posed, kept(in_world(near, posed.datum), valid), status)
 
     inputs = (proj, pixels, camera_index.long(), point_index.long(), weight)
     points, depth, residual, status = recomputed(derivable, *inputs, values=values)
@@ -180,9 +180,16 @@ def _find(posed: PosedTracks) -> tuple[FoundPoints, Tensor]:
     polish = 2 if posed.dtype == torch.float64 else 0
     eps = torch.finfo(posed.dtype).eps
     found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = in_world(found.points, posed.around)
+    x, y, z = in_world(found.points, posed.datum)
     _, _, depth = project_listed(listed.camera, at(torch.stack([x, y, z]), listed.point))
     behind = summed((~listed.unused & ~(depth > 0)).to(depth.dtype), listed.point, count)
     held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
-    status = judge_points(found, posed.frame, in_front=behind == 0, representable=held)
+    frame = posed.frame
+    status = judge(
+        finite=frame.finite,
+        enough=frame.enough,
+        posed=found.posed,
+        near=found.near & held,
+        in_front=behind == 0,
+    )
     return found, status

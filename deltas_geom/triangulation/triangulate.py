@@ -1,42 +1,23 @@
-"""Weighted, masked n-view DLT triangulation; every point carries a Status.
-
-Each point is solved in its own rig frame (rig_frame.py), in float64 whatever the input, where the
-device has it. Backward keeps the inputs, for points alone also the points, and computes the rest
-again.
-"""
-
-from typing import Literal, NamedTuple
+"""Weighted, masked n-view DLT triangulation; every point carries a Status."""
 
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.chunks import in_chunks, surely_all
-from deltas_geom.numerics.evaluation import WithLagrangian
-from deltas_geom.numerics.ldl import Vector4
-from deltas_geom.status import Status
-from deltas_geom.triangulation.equations import (
-    Alike,
-    Posed,
-    columns_of,
-    lagrangian_of,
-    pose,
-    prepared,
-    product_of,
+from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
+from deltas_geom.numerics.evaluation import (
+    Function,
+    WithAdjoint,
+    cut_points,
+    recomputed,
+    transformed,
 )
-from deltas_geom.triangulation.observed import Cameras, Observations, Vector3, check_observed
-from deltas_geom.triangulation.reprojection import in_views, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.equations import Frame, Rig, rig_of
+from deltas_geom.triangulation.judge import ok
+from deltas_geom.triangulation.long import LongWay
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.results import Triangulation
-from deltas_geom.triangulation.rig_frame import (
-    FoundPoints,
-    derivable_points,
-    find_points,
-    in_world,
-    judge_points,
-    kept,
-    kept_in_world,
-)
-from deltas_geom.triangulation.uncertainty import covariance_of, representable, unpacked3
+from deltas_geom.triangulation.short import FEW, ShortRig, short_rig
+from deltas_geom.triangulation.short_way import ShortWay
 
 
 @without_autocast
@@ -46,45 +27,13 @@ def triangulate_points(
     weights: Tensor | None = None,
     mask: Tensor | None = None,
     *,
-    frame: Literal["rig", "world"] = "rig",
+    frame: Frame = "rig",
 ) -> Tensor:
     """Points ``(*B, N, 3)`` alone; see :func:`triangulate`, which also says which are valid.
 
     (0, 0, 0) stands for no answer, and may be one.
     """
-    _check_frame(frame)
-    check_observed(proj, pixels, weights, mask)
-
-    def prepare(proj: Tensor) -> Cameras | Alike:
-        return prepared(proj, weights, mask, kind=frame)
-
-    def values(known: Cameras | Alike, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
-        posed = pose(known, pixels, *used, kind=frame, dtype=proj.dtype)
-        found, places, status = _find(posed, frame)
-        valid = status == Status.OK.value
-        points = _outward(kept_in_world(places, valid), proj.dtype)
-        return points, _places_in_frame(found, proj.dtype), valid
-
-    def derivable(proj: Tensor, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
-        posed = pose(prepare(proj), pixels, *used, kind=frame, dtype=proj.dtype)
-        found, _, status = _find(posed, frame)
-        valid = status == Status.OK.value
-        near = derivable_points(posed.normal, posed.frame, found.vector, valid)
-        points = _outward(kept(near, posed.around, valid), proj.dtype)
-        return points, _places_in_frame(found, proj.dtype), valid
-
-    def lagrangian(found: tuple[Tensor, ...], gradient: Tensor, *tensors: Tensor | None) -> Tensor:
-        cameras, pixels, *used = tensors
-        assert cameras is not None and pixels is not None
-        posed = pose(prepare(cameras), pixels, *used, kind=frame, dtype=cameras.dtype)
-        places, valid = found
-        x, y, z = places.to(posed.around.dtype).unbind(dim=-2)
-        gx, gy, gz = gradient.to(posed.around.dtype).unbind(dim=-1)
-        return lagrangian_of(posed, (x, y, z), valid, (gx, gy, gz))
-
-    points = ((pixels, -2), (weights, -1), (mask, -1))
-    function = WithLagrangian(derivable, lagrangian)
-    return in_chunks(function, values, proj, points, dims=(-2, -1, -1), prepare=prepare)[0]
+    return _Call(KnownCameras(proj), pixels, weights, mask, frame).points()
 
 
 @without_autocast
@@ -94,7 +43,7 @@ def triangulate(
     weights: Tensor | None = None,
     mask: Tensor | None = None,
     *,
-    frame: Literal["rig", "world"] = "rig",
+    frame: Frame = "rig",
     covariance: bool = False,
 ) -> Triangulation:
     """Triangulate matched pixels of V views by weighted DLT, differentiably.
@@ -128,121 +77,121 @@ def triangulate(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.0000, 2.0000]])
     """
-    _check_frame(frame)
-    check_observed(proj, pixels, weights, mask)
-
-    def described(solved: _Solved) -> tuple[Tensor, ...]:
-        observed, valid = solved.observed, solved.status == Status.OK.value
-        used = ~observed.weights.unused & valid.unsqueeze(-2)
-        seen = reproject(observed.proj, solved.points, used)
-        limit = torch.finfo(proj.dtype).max
-        found: tuple[Tensor, ...] = (
-            torch.stack(solved.points, dim=-1),
-            torch.where(valid.unsqueeze(-2), seen.depth, 0.0),
-            residual_of(seen, observed.xy, observed.weights.squared),
-            parallax_of(solved.centers, solved.points, used.to(seen.x.dtype)),
-        )
-        outward = tuple(tensor.to(proj.dtype).clamp(-limit, limit) for tensor in found)
-        if covariance:
-            noise = unpacked3(covariance_of(observed.proj, seen, observed.weights.squared))
-            unit = observed.weights.largest.squeeze(-2)[..., None, None]
-            # Divided twice: the square of a small weight may be 0.
-            outward = (*outward, representable(noise / unit / unit, proj.dtype))
-        return (*outward, solved.status)
-
-    def prepare(proj: Tensor) -> Cameras | Alike:
-        return prepared(proj, weights, mask, kind=frame)
-
-    def values(known: Cameras | Alike, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
-        return described(_values(pose(known, pixels, *used, kind=frame, dtype=proj.dtype), frame))
-
-    def derivable(proj: Tensor, pixels: Tensor, *used: Tensor | None) -> tuple[Tensor, ...]:
-        posed = pose(prepare(proj), pixels, *used, kind=frame, dtype=proj.dtype)
-        return described(_derivable(posed, frame))
-
-    dims = (-2, -1, -1, -1, *([-3] if covariance else []), -1)
-    points = ((pixels, -2), (weights, -1), (mask, -1))
-    found = in_chunks(derivable, values, proj, points, dims=dims, prepare=prepare)
-    places, depth, residual, parallax, *noise, status = found
-    valid = status == Status.OK.value
-    return Triangulation(
-        places, depth, status, valid, residual, parallax, noise[0] if noise else None
-    )
+    call = _Call(KnownCameras(proj), pixels, weights, mask, frame)
+    return call.full(covariance=covariance)
 
 
-class _Solved(NamedTuple):
-    """Points before they leave the solver's type and layout.
+_PLAIN = (torch.float32, torch.float64, torch.bool)  # NumPy has no bfloat16
 
-    Attributes:
-        observed: what was seen.
-        centers: ``(*B, V, 3)`` of the cameras.
-        points: three ``(*B, N)`` in the world; 0 where they fail.
-        status: ``(*B, N)``.
+
+class KnownCameras:
+    """Cameras, and what depends on them alone: computed when it is first needed, and then kept.
+
+    Args:
+        proj: ``(*B, V, 3, 4)``, which stay as they are.
     """
 
-    observed: Observations
-    centers: Tensor
-    points: Vector3
-    status: Tensor
+    def __init__(self, proj: Tensor) -> None:
+        self.proj = proj
+        self._short: ShortRig | None = None
+        self._long: Rig | None = None
+
+    def short(self) -> ShortRig:
+        """For few points."""
+        if self._short is None:
+            self._short = short_rig(self.proj.detach().numpy())
+        return self._short
+
+    def long(self) -> Rig:
+        """For any number of points; without gradient."""
+        if self._long is None:
+            self._long = rig_of(self.proj.detach())
+        return self._long
 
 
-@torch.no_grad()
-def _find(posed: Posed, frame: str) -> tuple[FoundPoints, Vector3, Tensor]:
-    """Points, the same in the world, and their status, without gradient."""
+class _Call:
+    """One triangulation: how it is computed, and how it is derived.
 
-    def product(x: Vector4) -> Vector4:
-        return product_of(posed, x)
+    Args:
+        known: the cameras.
+        pixels: ``(*B, V, N, 2)``.
+        weights: ``(*B, V, N)`` or None.
+        mask: ``(*B, V, N)`` or None.
+        frame: in which points are solved.
+    """
 
-    # What the normal matrix loses of the rows' digits matters to those who have them.
-    polish, columns = 0, None
-    if posed.dtype == torch.float64 and frame == "world":
-        columns = columns_of(
-            posed.observed
-        )  # extreme weights leave the normal matrix few digits there
-    elif posed.dtype == torch.float64:
-        polish = 2
-    eps = torch.finfo(posed.dtype).eps
-    found = find_points(
-        posed.normal, posed.frame, eps=eps, product=product, polish=polish, columns=columns
-    )
-    places = in_world(found.points, posed.around)
-    # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-    depth = in_views(posed.observed.proj[..., 2, :], places)
-    unused = posed.observed.weights.unused
-    if not surely_all(~unused):
-        depth = torch.where(unused, 1.0, depth)
-    x, y, z = places
-    held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
-    in_front = depth.amin(dim=-2) > 0
-    status = judge_points(found, posed.frame, in_front=in_front, representable=held)
-    return found, places, status
+    def __init__(
+        self,
+        known: KnownCameras,
+        pixels: Tensor,
+        weights: Tensor | None,
+        mask: Tensor | None,
+        frame: Frame,
+    ) -> None:
+        if frame not in ("rig", "world"):
+            raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+        proj = known.proj
+        self.batch = check_observed(proj, pixels, weights, mask)
+        self.tensors = (proj, pixels, weights, mask)
+        self.known, self.frame, self.dtype = known, frame, proj.dtype
+        self.alike = weights is None and mask is None
+        # What a compiler, a transform or another device holds has no values to look at.
+        plain = all(t is None or (values_at_hand(t) and t.dtype in _PLAIN) for t in self.tensors)
+        few = 0 < self.batch.numel() * pixels.shape[-2] <= FEW
+        self.way: ShortWay | LongWay
+        if plain and few and not transformed(*self.tensors):
+            self.way = ShortWay(known.short(), frame, proj.dtype)
+        else:
+            self.way = self.long(known.long())
+
+    def long(self, rig: Rig) -> LongWay:
+        """The long way by these cameras."""
+        return LongWay.of(rig, self.batch, self.frame, self.dtype, alike=self.alike)
+
+    def points(self) -> Tensor:
+        """Points ``(*B, N, 3)``."""
+
+        def derivable(proj: Tensor, *seen: Tensor | None) -> tuple[Tensor]:
+            way = self.long(rig_of(proj))
+            return (way.outward(way.derive(way.see(*seen))[0]),)
+
+        def adjoint(
+            gradients: tuple[Tensor], needed: tuple[bool, ...], *tensors: Tensor | None
+        ) -> tuple[Tensor | None, ...]:
+            found = self.way.adjoint(gradients[0], needed, *tensors[1:])
+            return (*map(_shaped_as, found, tensors), None)
+
+        rule = WithAdjoint(derivable, adjoint)
+        return self._computed(rule, lambda _, *seen: self.way.points(*seen), (-2,))[0]
+
+    def full(self, *, covariance: bool) -> Triangulation:
+        """Points with all that is known about them."""
+
+        def derivable(proj: Tensor, *seen: Tensor | None) -> tuple[Tensor, ...]:
+            way = self.long(rig_of(proj))
+            equations = way.see(*seen)
+            return way.described(equations, *way.derive(equations), covariance)
+
+        def values(_: Tensor, *seen: Tensor | None) -> tuple[Tensor, ...]:
+            return self.way.full(*seen, covariance=covariance)
+
+        dims = (-2, -1, -1, -1, *([-3] if covariance else []), -1)
+        points, depth, residual, parallax, *noise, status = self._computed(derivable, values, dims)
+        return Triangulation(
+            points, depth, status, ok(status), residual, parallax, noise[0] if noise else None
+        )
+
+    def _computed(
+        self, function: Function, values: Function, outputs: tuple[int, ...]
+    ) -> tuple[Tensor, ...]:
+        pixels = self.tensors[1]
+        assert pixels is not None
+        cut = cut_points(pixels, -2, -1, -1, outputs=outputs, parts=True)
+        return recomputed(function, *self.tensors, values=values, cut=cut)
 
 
-def _values(posed: Posed, frame: str) -> _Solved:
-    _, places, status = _find(posed, frame)
-    points = kept_in_world(places, status == Status.OK.value)
-    return _Solved(posed.observed, posed.centers, points, status)
-
-
-def _derivable(posed: Posed, frame: str) -> _Solved:
-    found, _, status = _find(posed, frame)
-    valid = status == Status.OK.value
-    near = derivable_points(posed.normal, posed.frame, found.vector, valid)
-    return _Solved(posed.observed, posed.centers, kept(near, posed.around, valid), status)
-
-
-def _outward(points: Vector3, dtype: torch.dtype) -> Tensor:
-    return torch.stack(points, dim=-1).to(dtype)
-
-
-def _places_in_frame(found: FoundPoints, dtype: torch.dtype) -> Tensor:
-    """``(*B, 3, N)`` in units of the frame, to start from; float32 at least."""
-    x, y, z, w = found.vector
-    inverse = w.reciprocal()
-    places = torch.stack([x * inverse, y * inverse, z * inverse], dim=-2)
-    return places.to(torch.promote_types(dtype, torch.float32))
-
-
-def _check_frame(frame: str) -> None:
-    if frame not in ("rig", "world"):
-        raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+def _shaped_as(gradient: Tensor | None, tensor: Tensor | None) -> Tensor | None:
+    """The gradient of a tensor that was broadcast and cast, in its own shape and type."""
+    if gradient is None or tensor is None:
+        return None
+    return gradient.sum_to_size(tensor.shape).to(tensor.dtype)

@@ -13,10 +13,10 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import check_bool, check_floating, check_shapes
 from deltas_geom.epipolar.fundamental import cross_matrix
-from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.chunks import in_chunks
+from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.evaluation import cut_points, recomputed
 from deltas_geom.status import Status
-from deltas_geom.triangulation.observed import solver_dtype
+from deltas_geom.triangulation.judge import judge
 
 
 class TwoViewTriangulation(NamedTuple):
@@ -105,8 +105,8 @@ def triangulate_two_view(
             status = _judge(seen, _solve(seen), dtype)
         return outward(seen, _solve(seen, status == Status.OK.value), status)
 
-    cut = ((pixels, -2), (mask, -1))
-    found = in_chunks(derivable, values, proj, cut, dims=(-2, -2, -1, -1, -1, -1))
+    cut = cut_points(pixels, -2, -1, outputs=(-2, -2, -1, -1, -1, -1))
+    found = recomputed(derivable, proj, pixels, mask, values=values, cut=cut)
     points, corrected, depth, residual, parallax, status = found
     valid = status == Status.OK.value
     return TwoViewTriangulation(points, corrected, depth, status, valid, residual, parallax)
@@ -280,16 +280,7 @@ def _judge(seen: _Seen, solved: _Solved, dtype: torch.dtype) -> Tensor:
     # At a camera's centre the depth is 0 within rounding.
     apart = solved.beside > 64 * torch.finfo(length.dtype).eps * length.unsqueeze(-2)
     in_front = (apart & (solved.depth > 0)).all(dim=-2)
-    status = torch.zeros_like(seen.enough, dtype=torch.int8)
-    for passed, reason in (
-        (in_front, Status.BEHIND_CAMERA),
-        (near, Status.AT_INFINITY),
-        (posed, Status.NO_PARALLAX),
-        (seen.enough, Status.TOO_FEW_VIEWS),
-        (seen.finite, Status.NOT_FINITE_INPUT),
-    ):
-        status = torch.where(passed, status, torch.full_like(status, reason.value))
-    return status
+    return judge(finite=seen.finite, enough=seen.enough, posed=posed, near=near, in_front=in_front)
 
 
 def _cross(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -4,18 +4,17 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
-from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.triangulation.dlt import Symmetric3, inverse3, normal_matrix
+from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3
+from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     Cameras,
     Vector3,
     cameras_of,
-    check_weights,
     clean_pixels,
-    solver_dtype,
-    weigh,
 )
 from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.weights import check_weights, weigh
 
 
 @without_autocast
@@ -49,11 +48,14 @@ def reprojection_residual(
     batch = batch_shape(proj.shape[:-3], points.shape[:-2])
     batch = check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
     cameras, (places, known) = cameras_of(proj), _clean_points(points)
-    xy, sound = clean_pixels(pixels)
-    sound = sound & (cameras.sick == 0).unsqueeze(-1)
+    x, y, sound = clean_pixels(pixels)
+    healthy = (cameras.broken == 0).unsqueeze(-1)
+    sound = (
+        healthy.expand(*healthy.shape[:-1], points.shape[-2]) if sound is None else sound & healthy
+    )
     weighed = weigh(weights, mask, batch=batch, like=weights.unsqueeze(-1), sound=sound)
     used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
-    residual = residual_of(reproject(cameras.proj, places, used), xy, weighed.squared)
+    residual = residual_of(reproject(cameras.proj, places, used), x, y, weighed.squared)
     return residual.clamp(max=torch.finfo(proj.dtype).max).to(proj.dtype)
 
 
@@ -78,8 +80,8 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     check_bool(used=used)
     batch_shape(proj.shape[:-3], points.shape[:-2], used.shape[:-2])
     cameras, (places, known) = cameras_of(proj.detach()), _clean_points(points.detach())
-    sick = cameras.sick.unsqueeze(-1) > 0
-    sound = known & ~(sick & used).any(dim=-2)
+    broken = cameras.broken.unsqueeze(-1) > 0
+    sound = known & ~(broken & used).any(dim=-2)
     counted = (used & sound.unsqueeze(-2)).to(cameras.proj.dtype)
     return parallax_of(cameras.centers, places, counted).to(proj.dtype)
 
@@ -147,7 +149,7 @@ def point_covariance(
     batch = batch_shape(*shapes)
     cameras, (places, known) = cameras_of(proj), _clean_points(points)
     work = cameras.proj.dtype
-    sound, noise = cameras.sick == 0, None
+    sound, noise = cameras.broken == 0, None
     if pose_covariance is not None:
         stated = _fits(pose_covariance.to(work), torch.finfo(work).max ** 0.25)
         noise = torch.where(stated, pose_covariance, 0.0).to(work)
@@ -236,7 +238,7 @@ def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetr
     """
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
     # The derivative of a pixel by the point is its equations, divided by the depth.
-    normal = normal_matrix(proj[..., :3], found.x, found.y, by_depth)
+    normal = normal_matrix(normal_coefficients(proj[..., :3]), found.x, found.y, by_depth)
     enough = found.seen.sum(dim=-2) >= 2
     with torch.no_grad():
         trace, limit = normal[0] + normal[3] + normal[5], torch.finfo(by_depth.dtype).max
@@ -274,7 +276,7 @@ def _of_poses(
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
     view = cameras.proj.unsqueeze(-3)  # each view alone, to keep their information apart
     x, y, w = (tensor.unsqueeze(-2) for tensor in (found.x, found.y, by_depth))
-    m00, m01, m02, m11, m12, m22 = normal_matrix(view[..., :3], x, y, w)
+    m00, m01, m02, m11, m12, m22 = normal_matrix(normal_coefficients(view[..., :3]), x, y, w)
     information = unpacked3((m00, m01, m02, m11, m12, m22))  # (*B, V, N, 3, 3)
     ox, oy, oz = (
         component.unsqueeze(-2) - center.unsqueeze(-1)

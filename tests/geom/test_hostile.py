@@ -24,7 +24,7 @@ from deltas_geom import (
     triangulate_two_view,
 )
 from deltas_geom.testing import default_intrinsics, rigid
-from deltas_geom.triangulation.observed import NEGLIGIBLE_WEIGHT
+from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 IMAGE_SIZE = (480, 640)
 NAMES = ("ordinary", "pixels", "weights", "cameras", "equal", "everything", "outliers", "behind")

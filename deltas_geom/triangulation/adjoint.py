@@ -1,0 +1,161 @@
+"""The gradient of points, from their equations: nothing of how they were found is derived.
+
+A change dM of a normal matrix changes its null vector x by -(M - mu)^+ dM x, and with it a sum
+whose gradient by x is g by -y^T dM x, y = (M - mu)^+ g. M being a sum of squared rows, that is a
+product of the errors of x and of y, whose derivatives by pixels, weights and cameras are plain.
+
+Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 15 (implicit functions).
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.numerics.ldl import Vector4, dot, dot3, multiply, unit
+from deltas_geom.numerics.null_vector import solve_in_complement
+from deltas_geom.numerics.sums import over_points, product
+from deltas_geom.triangulation.equations import Equations, Rig, out_of_frame
+from deltas_geom.triangulation.observed import Observations, Vector3, homogeneous_in_views, inverted
+from deltas_geom.triangulation.rig_frame import squared_length
+from deltas_geom.triangulation.solution import of_trace_one
+
+
+class Gradients(NamedTuple):
+    """Of the sum of gradient * points, in the solver's type; broadcast as the inputs were.
+
+    Attributes:
+        proj: ``(*B, V, 3, 4)``, or None where not asked for.
+        pixels: ``(*B, V, N, 2)``.
+        weights: ``(*B, V, N)`` by the squared weights.
+    """
+
+    proj: Tensor | None
+    pixels: Tensor
+    weights: Tensor
+
+
+class _Pull(NamedTuple):
+    """What of the points' gradient reaches the equations.
+
+    Attributes:
+        place: four ``(*B, N)``: the points, homogeneous, from the datum.
+        push: four ``(*B, N)``: y as such a point.
+        framed: five ``(*B, N)``, of 1, the squared distance of a camera from the datum and its
+            three coordinates: the gradient by a view's squared weight, through the frame.
+    """
+
+    place: Vector4
+    push: Vector4
+    framed: tuple[Tensor, ...]
+
+
+def gradients_of(
+    equations: Equations, vector: Vector4, valid: Tensor, gradient: Vector3, *, of_cameras: bool
+) -> Gradients:
+    """Gradients of what the equations were made of, to first order.
+
+    Args:
+        equations: of N points.
+        vector: their null vectors in the frame; anything where not valid.
+        valid: ``(*B, N)`` bool.
+        gradient: three ``(*B, N)`` by the points.
+        of_cameras: are those by the cameras wanted, too?
+    """
+    pull = _pulled(equations, vector, valid, gradient)
+    rig, of_cameras_and_frames = equations.rig, []
+
+    def of_part(part: Observations, *rows: Tensor) -> tuple[Tensor, ...]:
+        x, y, known = part
+        place, push, framed = rows[:4], rows[4:8], rows[8:]
+        (a, b, c), (d, e, f) = (homogeneous_in_views(rig.near, some) for some in (place, push))
+        across, down, along, below = x * c - a, y * c - b, x * f - d, y * f - e
+        by_weight = product(rig.moments[0].mT, torch.stack(framed, dim=-2))
+        by_weight = by_weight - torch.addcmul(across * along, down, below)
+        by_x = torch.addcmul(f * across, c, along) * -known.squared
+        by_y = torch.addcmul(f * down, c, below) * -known.squared
+        if of_cameras:
+            sums = [torch.stack(some, dim=-2) for some in (place, push, framed[1:])]
+            of_cameras_and_frames.append(_over_points(part, (across, down), (along, below), *sums))
+        return by_x, by_y, by_weight
+
+    rows = (*pull.place, *pull.push, *pull.framed)
+    by_x, by_y, by_weight = equations.each(of_part, *rows)
+    pixels, proj = torch.stack([by_x, by_y], dim=-1), None
+    if of_cameras:
+        near, centers = (
+            sum(some[1:], some[0]) for some in zip(*of_cameras_and_frames, strict=True)
+        )
+        proj = _of_cameras(rig, near, centers)
+    return Gradients(proj, pixels, by_weight)
+
+
+def _over_points(
+    part: Observations,
+    errors: tuple[Tensor, Tensor],
+    pushed: tuple[Tensor, Tensor],
+    place: Tensor,
+    push: Tensor,
+    framed: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Gradients ``(*B, V, 3, 4)`` by the cameras near the datum, ``(*B, V, 4)`` of the frames."""
+    x, y, known = part
+    (u, v), (p, q) = ([error * known.squared for error in some] for some in (errors, pushed))
+    rows = ((u, p), (v, q), (-torch.addcmul(x * u, y, v), -torch.addcmul(x * p, y, q)))
+    near = [over_points(one, push) + over_points(other, place) for one, other in rows]
+    return torch.stack(near, dim=-2), over_points(known.squared.expand_as(u), framed)
+
+
+def _pulled(equations: Equations, vector: Vector4, valid: Tensor, gradient: Vector3) -> _Pull:
+    frame = equations.frame
+    matrix, share = of_trace_one(equations.normal, valid)
+    g0, g1, g2 = (torch.where(valid, component, 0.0) for component in gradient)
+    x0, x1, x2, x3 = (
+        torch.where(valid, component, constant)
+        for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
+    )
+    x = unit((x0, x1, x2, x3))
+    mu = dot(x, multiply(matrix, x))
+    scale = frame.unit * share / x[3]
+    along = dot3((g0, g1, g2), (x[0], x[1], x[2])) / x[3]
+    of_x = (g0 * scale, g1 * scale, g2 * scale, -along * scale)
+    y = solve_in_complement(matrix, x, mu, of_x)
+    # By the frame's origin and unit, which matter where the errors do not vanish: M x = mu x and
+    # M y = mu y + of_x leave little of what T^T M T says. In the world's frame they are fixed.
+    by_unit = 2 * mu / (share * frame.unit) * (0.0 if equations.fixed else 1.0)
+    half = 0.5 * by_unit
+    by_origin = [-half * (y[3] * x[k] + x[3] * y[k]) for k in range(3)]
+    total = frame.total
+    beta = by_unit * x[3] * y[3] / (2 * frame.unit * total)
+    ox, oy, oz = frame.origin
+    alpha = [component / total for component in by_origin]
+    constant = beta * (squared_length((ox, oy, oz)) - frame.unit.square())
+    constant = constant - dot3((alpha[0], alpha[1], alpha[2]), (ox, oy, oz))
+    twice = 2 * beta
+    linear = [a - twice * o for a, o in zip(alpha, (ox, oy, oz), strict=True)]
+    framed = (constant, beta, *linear)
+    return _Pull(out_of_frame(frame, x), out_of_frame(frame, y), framed)
+
+
+def weight_slope(equations: Equations, weights: Tensor) -> Tensor:
+    """Derivative of the squared weights by the weights ``(*B, V, N)``, 0 where unused."""
+
+    def slope(part: Observations, weight: Tensor) -> tuple[Tensor]:
+        known = part.weights
+        return (2 * torch.copysign(known.squared.sqrt(), weight) / known.largest,)
+
+    return equations.each(slope, weights)[0]
+
+
+def _of_cameras(rig: Rig, near: Tensor, centers: Tensor) -> Tensor:
+    """``(*B, V, 3, 4)`` from such sums over points, and ``(*B, V, 4)`` of the frames."""
+    cameras, datum = rig.cameras, rig.datum
+    rows, last = near[..., :3], near[..., 3:]
+    offset = cameras.centers - datum
+    center = centers[..., 1:] + 2 * offset * centers[..., :1]
+    cofactors, inverse = inverted(cameras.proj[..., :3])
+    position = -inverse[..., None] * (cofactors * center.unsqueeze(-2)).sum(dim=-1)
+    position = position.unsqueeze(-1)  # by the last column, and through it by the others
+    rows = rows + last * datum.unsqueeze(-2) + position * cameras.centers.unsqueeze(-2)
+    found = torch.cat([rows, last + position], dim=-1)
+    return found * (1 - cameras.broken)[..., None, None]

@@ -1,0 +1,39 @@
+"""Why a point has no answer: the reasons, and which of them counts, for every solver."""
+
+import torch
+from torch import Tensor
+
+from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.status import Status
+
+
+def judge(
+    *, finite: Tensor, enough: Tensor, posed: Tensor, near: Tensor, in_front: Tensor
+) -> Tensor:
+    """Status ``(*B, N)`` int8; of several reasons the first one here counts.
+
+    Args:
+        finite: ``(*B, N)`` bool: everything that is used is finite.
+        enough: two views or more are used.
+        posed: these stand apart, and beside the point, by more than rounding.
+        near: their rays meet at a place that can be told from infinity, and represented.
+        in_front: that is in front of all of them.
+    """
+    status = torch.zeros_like(in_front, dtype=torch.int8)
+    reasons = (
+        (in_front, Status.BEHIND_CAMERA),
+        (near, Status.AT_INFINITY),
+        (posed, Status.NO_PARALLAX),
+        (enough, Status.TOO_FEW_VIEWS),
+        (finite, Status.NOT_FINITE_INPUT),
+    )
+    if all(surely_all(passed) for passed, _ in reasons):
+        return status
+    for passed, reason in reasons:
+        status = torch.where(passed, status, status.new_full((), reason.value))
+    return status
+
+
+def ok(status: Tensor) -> Tensor:
+    """Which points are valid ``(*B, N)``."""
+    return status == Status.OK.value

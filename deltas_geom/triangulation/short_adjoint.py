@@ -1,0 +1,102 @@
+"""The gradient of the short way's points: `adjoint`, from rows and eigenvectors."""
+
+import numpy as np
+
+from deltas_geom.triangulation.short import Array, ShortRig, Solved
+
+
+def gradients(
+    rig: ShortRig, solved: Solved, gradient: Array, *, fixed: bool, of_cameras: bool
+) -> tuple[Array | None, Array, Array]:
+    """Of the sum of gradient * points, by cameras, pixels and the size of weights.
+
+    Args:
+        rig: of the cameras.
+        solved: the points.
+        gradient: ``(*B, N, 3)``.
+        fixed: were they solved in the world's frame?
+        of_cameras: else the first result is None.
+
+    Returns:
+        ``(*B, V, 3, 4)``, ``(*B, V, N, 2)`` and ``(*B, V, N)``, broadcast as the inputs were.
+    """
+    with np.errstate(all="ignore"):
+        valid = solved.status == 0
+        x = np.where(valid[..., None], solved.vectors[..., 0], (0.0, 0.0, 0.0, 1.0))
+        push, mu = _pushed(solved, x, np.where(valid[..., None], gradient, 0.0), valid)
+        error, pushed = (solved.equations @ v[..., None, :, None] for v in (x, push))
+        error, pushed = error[..., 0], pushed[..., 0]  # (*B, N, V, 2)
+        depth, deep = ((solved.cameras[..., 2, :] @ v[..., None])[..., 0] for v in (x, push))
+        squared = solved.share * solved.share
+        by_pixel = deep[..., None] * error + depth[..., None] * pushed
+        by_pixel = -squared[..., None] * by_pixel
+        constant, linear, square = _by_frame(solved, x, push, mu * (not fixed))
+        distance = (rig.offset * rig.offset).sum(axis=-1)
+        by_square = constant[..., None] + linear @ np.swapaxes(rig.offset, -1, -2)
+        by_square = by_square + square[..., None] * distance[..., None, :]
+        by_square = by_square - (error * pushed).sum(axis=-1)
+        by_size = 2 * solved.share / solved.largest * by_square
+        proj = None
+        if of_cameras:
+            places = _from_datum(solved, x), _from_datum(solved, push)
+            near = _over_points(solved, squared, error, pushed, *places)
+            bent = np.concatenate([linear, square[..., None]], axis=-1)
+            centers = np.swapaxes(np.broadcast_to(squared, solved.depth.shape), -1, -2) @ bent
+            proj = _of_cameras(rig, near, centers)
+        return proj, np.moveaxis(by_pixel, -2, -3), np.swapaxes(by_size, -1, -2)
+
+
+def _pushed(solved: Solved, x: Array, gradient: Array, valid: Array) -> tuple[Array, Array]:
+    """(M - mu)^+ of the gradient by x, whose last coordinate divides; and mu, the eigenvalue."""
+    scale = solved.unit / x[..., 3]
+    along = (gradient * x[..., :3]).sum(axis=-1) / x[..., 3]
+    of_x = np.concatenate([gradient, -along[..., None]], axis=-1) * scale[..., None]
+    mu = np.where(valid, solved.values[..., 0], 0.0)
+    gaps = np.where(valid[..., None], solved.values[..., 1:] - mu[..., None], 1.0)
+    others = np.where(valid[..., None, None], solved.vectors[..., 1:], 0.0)
+    shares = (np.swapaxes(others, -1, -2) @ of_x[..., None])[..., 0] / gaps
+    found: Array = (others @ shares[..., None])[..., 0]
+    return found, mu
+
+
+def _by_frame(solved: Solved, x: Array, push: Array, mu: Array) -> tuple[Array, Array, Array]:
+    """By a view's squared weight through the frame: of 1, of its offset and of that squared."""
+    squared = solved.share * solved.share
+    total = np.maximum(squared.sum(axis=-1), 1.0)
+    by_unit = 2 * mu / solved.unit
+    by_origin = x[..., 3:] * push[..., :3] + push[..., 3:] * x[..., :3]
+    by_origin = -0.5 * by_unit[..., None] * by_origin / total[..., None]
+    square = by_unit * x[..., 3] * push[..., 3] / (2 * solved.unit * total)
+    reach = (solved.origin * solved.origin).sum(axis=-1)
+    constant = square * (reach - solved.unit**2) - (by_origin * solved.origin).sum(axis=-1)
+    return constant, by_origin - 2 * square[..., None] * solved.origin, square
+
+
+def _from_datum(solved: Solved, v: Array) -> Array:
+    """Homogeneous points ``(*B, N, 4)`` counted from the datum."""
+    last = v[..., 3:] / solved.unit[..., None]
+    return np.concatenate([v[..., :3] + solved.origin * last, last], axis=-1)
+
+
+def _over_points(
+    solved: Solved, squared: Array, error: Array, pushed: Array, place: Array, push: Array
+) -> Array:
+    """Gradient ``(*B, V, 3, 4)`` by the cameras of points counted from the datum."""
+
+    def rows(errors: Array) -> Array:
+        weighed = squared[..., None] * errors
+        last = -(solved.pixels * weighed).sum(axis=-1, keepdims=True)
+        found = np.concatenate([weighed, last], axis=-1)
+        return np.swapaxes(found.reshape(*found.shape[:-2], -1), -1, -2)
+
+    found = rows(error) @ push + rows(pushed) @ place
+    return found.reshape(*found.shape[:-2], -1, 3, 4)
+
+
+def _of_cameras(rig: ShortRig, near: Array, centers: Array) -> Array:
+    center = centers[..., :3] + 2 * rig.offset * centers[..., 3:]
+    position = -(np.swapaxes(rig.inverse, -1, -2) @ center[..., None])
+    last = near[..., 3:]
+    rows = near[..., :3] + last * rig.datum[..., None, :] + position * rig.centers[..., None, :]
+    found = np.concatenate([rows, last + position], axis=-1)
+    return np.where(rig.finite[..., None, None], found, 0.0)

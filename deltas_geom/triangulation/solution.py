@@ -1,0 +1,138 @@
+"""From normal matrices in their rig frames to points, and the derivative of these.
+
+How the matrices were made, from pixels, rays or lists of observations, does not matter here.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.numerics.ldl import Symmetric4, Vector4, unit
+from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
+from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.triangulation.rig_frame import RigFrame, squared_length
+
+# Of the inputs' rounding: an error of the solver that is lost in it.
+_NEGLIGIBLE = 0.01
+
+
+class FoundPoints(NamedTuple):
+    """Points before they are judged; without gradient.
+
+    Attributes:
+        points: three ``(*B, N)``, relative to the origin of the sums; anything if there is none.
+        vector: homogeneous, in the frame, of any length and sign.
+        posed: ``(*B, N)`` bool: there is a place or a direction.
+        near: ``(*B, N)`` bool: there is a place.
+    """
+
+    points: Vector3
+    vector: Vector4
+    posed: Tensor
+    near: Tensor
+
+
+@torch.no_grad()
+def find_points(
+    normal: Symmetric4,
+    frame: RigFrame,
+    *,
+    eps: float,
+    product: Callable[[Vector4], Vector4] | None = None,
+    polish: int = 0,
+) -> FoundPoints:
+    """The points that minimise the algebraic error.
+
+    Args:
+        normal: ten ``(*B, N)``, of homogeneous points of :func:`in_frame`.
+        frame: of the points.
+        eps: rounding of the inputs, relative.
+        product: see :func:`deltas_geom.numerics.null_vector.null_vector`.
+        polish: see there.
+    """
+    (x0, x1, x2, x3), simple = null_vector(
+        normal, accuracy=_NEGLIGIBLE * eps, product=product, polish=polish
+    )
+    points = _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
+    (x, y, z), (mx, my, mz) = points, frame.middle
+    distance = squared_length((x - mx, y - my, z - mz))
+    near = (16 * eps) ** 2 * distance <= frame.reach
+    return FoundPoints(points, (x0, x1, x2, x3), frame.posed & simple, near)
+
+
+def _at_distance(direction: Vector3, distance: Tensor, origin: Vector3) -> Vector3:
+    (x, y, z), (ox, oy, oz) = direction, origin
+    return (
+        torch.addcmul(ox, x, distance),
+        torch.addcmul(oy, y, distance),
+        torch.addcmul(oz, z, distance),
+    )
+
+
+def derivable_points(
+    normal: Symmetric4, frame: RigFrame, vector: Vector4, valid: Tensor
+) -> Vector3:
+    """Points relative to the origin of the sums, differentiable; finite where not valid.
+
+    Args:
+        normal: as for :func:`find_points`, differentiable.
+        frame: of the points.
+        vector: found for ``normal``.
+        valid: ``(*B, N)`` bool.
+    """
+    matrix, _ = of_trace_one(normal, valid)
+    x0, x1, x2, x3 = derivable_vector(matrix, vector, valid)
+    return _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
+
+
+def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]:
+    """The matrices divided by their traces, easy ones where not valid; and what they were
+    multiplied by, without gradient.
+    """
+    # Double where: what has failed must pass no gradient and no NaN.
+    easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+    trace = torch.where(valid, normal[0] + normal[4] + normal[7] + normal[9], 1.0).detach()
+    # Of trace 1, so that powers of its entries in the gradient neither overflow nor vanish.
+    share = trace.reciprocal()
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
+        torch.where(valid, entry, constant) * share
+        for entry, constant in zip(normal, easy, strict=True)
+    )
+    return (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), share
+
+
+def derivable_vector(matrix: Symmetric4, vector: Vector4, valid: Tensor) -> Vector4:
+    """The null vector, of about unit length, as a function of the matrix of trace 1.
+
+    Args:
+        matrix: of :func:`of_trace_one`.
+        vector: its null vector, of any length; anything where not valid.
+        valid: ``(*B, N)`` bool.
+    """
+    x0, x1, x2, x3 = (
+        torch.where(valid, component.detach(), constant)
+        for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
+    )
+    start = unit((x0, x1, x2, x3))
+    x0, x1, x2, x3 = rayleigh_step(matrix, start)
+    # Below the step's rounding there is no derivative, and not even a sign to divide by.
+    lost = start[3].abs() <= 4 * torch.finfo(x3.dtype).eps
+    return x0, x1, x2, torch.where(lost, start[3], x3)
+
+
+def in_world(points: Vector3, datum: Tensor) -> Vector3:
+    """Points in the world, from points relative to the origin of the sums ``(*B, 1, 3)``."""
+    (x, y, z), (ox, oy, oz) = points, datum.unbind(dim=-1)
+    return x + ox, y + oy, z + oz
+
+
+def kept(points: Vector3, valid: Tensor) -> Vector3:
+    """The valid ones of points three ``(*B, N)``, the others 0."""
+    if surely_all(valid):
+        return points
+    zero = points[0].new_zeros(())
+    x, y, z = (torch.where(valid, component, zero) for component in points)
+    return x, y, z

@@ -1,0 +1,115 @@
+"""How much each view counts for each point, and which count at all."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_bool, check_shapes
+from deltas_geom.numerics.arithmetic import solver_dtype, values_at_hand
+
+NEGLIGIBLE_WEIGHT = 1e-6
+"""A view whose weight is below this share of the point's largest counts as no view: its squared
+weight, times a small parallax, would be lost in the rounding of the normal matrix."""
+
+
+class Weights(NamedTuple):
+    """How much each view counts for each point.
+
+    The second to last dims are V; the last one is 1 where all points are alike.
+
+    Attributes:
+        squared: ``(*B, V, N)`` squared weights, a point's largest 1; 0 where unused. 0 or
+            anything where unsound, which makes the point fail.
+        largest: ``(*B, 1, N)`` a point's largest weight; 1 if that is 0.
+        unused: ``(*B, V, N)`` bool.
+        used: ``(*B, V, N)`` its complement as 1 and 0, to be summed.
+        sound: ``(*B, N)`` bool: every used weight is finite, and what it weighs is sound.
+    """
+
+    squared: Tensor
+    largest: Tensor
+    unused: Tensor
+    used: Tensor
+    sound: Tensor
+
+
+def weigh(
+    weights: Tensor | None,
+    mask: Tensor | None,
+    *,
+    batch: torch.Size,
+    like: Tensor,
+    sound: Tensor | None,
+) -> Weights:
+    """Tell used views from unused ones.
+
+    Args:
+        weights: ``(*B, V, N)`` or None for all 1. 0 = unused; the sign has no effect. NaN counts
+            as used.
+        mask: ``(*B, V, N)`` bool or None, True = used.
+        batch: dims to which all are expanded.
+        like: ``(*B, V, N, ...)`` of what is weighed.
+        sound: ``(*B, V, N)`` bool: it can be used; None where everything can.
+    """
+    views, work = like.shape[-3], solver_dtype(like)
+    alike = weights is None and mask is None
+    weight = like.new_ones((), dtype=work) if weights is None else weights.to(work)
+    if mask is not None:
+        weight = torch.where(mask, weight, 0.0)
+    weight = weight.expand(*batch, views, 1 if alike else like.shape[-2])
+    size = weight.detach().abs()
+    largest = size.amax(dim=-2, keepdim=True)
+    if sound is None and (alike or _all_count(size, largest)):
+        one = size.new_ones((*batch, views, 1))
+        none = torch.zeros_like(one, dtype=torch.bool)
+        share = one if alike else weight / largest
+        return Weights(share * share, largest, none, one, ~none[..., 0, :])
+    unused = size <= NEGLIGIBLE_WEIGHT * largest
+    counted = largest <= torch.finfo(work).max  # NaN is not, either
+    largest = torch.where(counted & (largest > 0), largest, 1.0)
+    # Double where: an infinite weight must not turn the gradient into NaN.
+    share = torch.where(counted, weight, 0.0) / largest
+    if sound is None:
+        sound = torch.ones_like(unused)
+    # What is not sound makes its point fail, if it is used: it need not be told from point to
+    # point where all are alike.
+    counts = ~unused if alike else sound & ~unused
+    return Weights(
+        squared=torch.where(counts, share * share, 0.0),
+        largest=largest,
+        unused=unused,
+        used=(~unused).to(work),
+        sound=(sound | unused).all(dim=-2) & counted.squeeze(-2),
+    )
+
+
+def _all_count(size: Tensor, largest: Tensor) -> bool:
+    """Is every weight finite and used, where that may be asked?"""
+    return (
+        values_at_hand(size)
+        and size.numel() > 0
+        and bool((size / largest).amin() > NEGLIGIBLE_WEIGHT)  # inf / inf is not
+    )
+
+
+def check_weights(
+    weights: Tensor | None,
+    mask: Tensor | None,
+    name: str,
+    seen: Tensor,
+    dims: str,
+    batch: torch.Size,
+) -> torch.Size:
+    """Raise unless weights and mask ``(*B, V, N)`` fit what is weighed, and the mask is bool.
+
+    Returns:
+        The batch dims to which all broadcast.
+    """
+    shapes = [batch, seen.shape[:-3]]
+    for label, tensor in (("weights", weights), ("mask", mask)):
+        if tensor is not None:
+            check_shapes(**{name: (seen, dims), label: (tensor, "V N")})
+            shapes.append(tensor.shape[:-2])
+    check_bool(mask=mask)
+    return batch_shape(*shapes)
