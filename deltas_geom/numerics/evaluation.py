@@ -1,21 +1,19 @@
-"""How results are computed: in which type, some points at a time, keeping only inputs for backward.
+"""How results are computed: some points at a time, keeping only inputs for backward.
 
 What lies between a function's inputs and its outputs is usually many times larger than both, so
 backward computes it again, and points are cut into chunks that stay in the cache. All that depends
 on who calls (a compiler, a transform of ``torch.func``, forward mode) is here.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from deltas_geom.numerics.sums import SERIAL
-
-_CHUNK, _SMALLEST_CHUNK = 16384, 512  # points
+from deltas_geom.numerics.chunks import Cut, chunks, joined
 
 Function = Callable[..., tuple[Tensor, ...]]
 Inputs = tuple[Tensor | None, ...]
@@ -44,54 +42,6 @@ class WithAdjoint:
     def __call__(self, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         """All outputs, differentiably."""
         return self.function(*tensors)
-
-
-class Cut(NamedTuple):
-    """How a function of many points is computed some points at a time.
-
-    Attributes:
-        size: points at a time.
-        inputs: for each input the dim, from the end, along which it holds points; 0 if it is whole
-            in every chunk.
-        outputs: the same of each output.
-    """
-
-    size: int
-    inputs: tuple[int, ...]
-    outputs: tuple[int, ...]
-
-
-def cut_points(
-    tensor: Tensor, *dims: int, outputs: tuple[int, ...], parts: bool = False
-) -> Cut | None:
-    """A cut for cameras and what is known of points, of which ``tensor`` ``(*B, V, N, K)`` tells N.
-
-    Args:
-        tensor: along whose second to last dim points lie. So few are taken at a time that no
-            operation on all their views starts threads.
-        *dims: of the inputs after the cameras.
-        outputs: of the outputs.
-        parts: will the function itself take some points at a time where it looks at views?
-    """
-    # A compiler fuses what lies between instead, and may not know the number of points.
-    if torch.compiler.is_compiling():
-        return None
-    few = serial_points(tensor)
-    whole = _CHUNK // max(1, tensor.shape[:-3].numel())
-    size = few * max(1, round(whole / few)) if parts else few
-    return Cut(_alike(tensor.shape[-2], size), (0, *dims), outputs)
-
-
-def serial_points(tensor: Tensor) -> int:
-    """How many points of ``(*B, V, N, K)`` all operations on their views compute in one thread."""
-    if torch.get_num_threads() == 1:
-        return _CHUNK
-    return max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
-
-
-def _alike(count: int, size: int) -> int:
-    """Points a chunk: a small one at the end would cost as many calls as a whole one."""
-    return max(1, -(-count // max(1, -(-count // size))))
 
 
 def recomputed(
@@ -132,31 +82,11 @@ def recomputed(
     return outputs
 
 
-def _chunks(cut: Cut, tensors: Sequence[Tensor | None], dims: Sequence[int]) -> Iterator[Inputs]:
-    """The tensors of each chunk."""
-    count = next(t.shape[d] for t, d in zip(tensors, dims, strict=True) if t is not None and d)
-    for start in range(0, max(1, count), cut.size):
-        yield tuple(
-            t if t is None or d == 0 else t.narrow(d, start, min(cut.size, count - start))
-            for t, d in zip(tensors, dims, strict=True)
-        )
-
-
 def _by_chunks(function: Function, cut: Cut | None, *tensors: Tensor | None) -> tuple[Tensor, ...]:
     if cut is None:
         return function(*tensors)
-    parts = [function(*some) for some in _chunks(cut, tensors, cut.inputs)]
+    parts = [function(*some) for some in chunks(cut, tensors, cut.inputs)]
     return tuple(map(joined, zip(*parts, strict=True), cut.outputs))
-
-
-def joined(parts: Sequence[Tensor], dim: int) -> Tensor:
-    """The parts as one tensor, copied in pieces for which no threads are started."""
-    if len(parts) == 1:
-        return parts[0]
-    few = max(1, SERIAL * parts[0].shape[dim] // max(1, parts[0].numel()))
-    if few < parts[0].shape[dim]:
-        parts = [piece for part in parts for piece in part.split(few, dim)]
-    return torch.cat(list(parts), dim)
 
 
 def transformed(*tensors: Tensor | None) -> bool:
@@ -204,15 +134,15 @@ class _Recomputed(torch.autograd.Function):
                 *_pulled(function, gradients, needed, *tensors, create_graph=True),
             )
         # A sum of gradients in a batch could not tell one from the other.
-        pull = partial(_pulled, function)
+        pull: Callable[..., Inputs] = partial(_pulled, function)
         if isinstance(function, WithAdjoint) and not any(map(_in_batch, gradients)):
             pull = function.adjoint
         if cut is None:
             return (*nothing[:3], *pull(gradients, needed, *tensors))
-        chunks = zip(
-            _chunks(cut, gradients, cut.outputs), _chunks(cut, tensors, cut.inputs), strict=True
+        pairs = zip(
+            chunks(cut, gradients, cut.outputs), chunks(cut, tensors, cut.inputs), strict=True
         )
-        parts = zip(*(pull(some, needed, *inputs) for some, inputs in chunks), strict=True)
+        parts = zip(*(pull(some, needed, *inputs) for some, inputs in pairs), strict=True)
         return (*nothing[:3], *map(_together, parts, cut.inputs))
 
 

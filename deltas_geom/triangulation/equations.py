@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.evaluation import joined
+from deltas_geom.numerics.chunks import joined
 from deltas_geom.numerics.ldl import Symmetric4, Vector4
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix

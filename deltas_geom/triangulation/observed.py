@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.checks import check_floating, check_shapes
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
-from deltas_geom.numerics.evaluation import serial_points
+from deltas_geom.numerics.chunks import serial_points
 from deltas_geom.numerics.sums import product
 from deltas_geom.triangulation.weights import Weights, check_weights, weigh
 
@@ -166,11 +166,10 @@ def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor
     Three ``(*B, V, N)``.
     """
     if torch.compiler.is_compiling():
-        seen = (_linear(row, places) for row in proj.unbind(dim=-2))
-    else:
-        rows = proj.transpose(-3, -2).flatten(-3, -2)  # all of p1, all of p2, all of p3
-        seen = product(rows, torch.stack(tuple(places), dim=-2)).chunk(3, dim=-2)
-    a, b, c = seen
+        a, b, c = (_linear(row, places) for row in proj.unbind(dim=-2))
+        return a, b, c
+    rows = proj.transpose(-3, -2).flatten(-3, -2)  # all of p1, all of p2, all of p3
+    a, b, c = product(rows, torch.stack(tuple(places), dim=-2)).chunk(3, dim=-2)
     return a, b, c
 
 

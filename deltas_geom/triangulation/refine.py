@@ -6,7 +6,7 @@ triangulated in the rig frame one step is enough for all but gross outliers.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +14,8 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.checks import batch_shape, check_floating, check_shapes
 from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.evaluation import cut_points, recomputed
+from deltas_geom.numerics.chunks import cut_points
+from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.symmetric3 import Symmetric3, solve3_scaled
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
@@ -148,12 +149,11 @@ class _Problem(NamedTuple):
     limit: float
 
 
-def _pose(
-    robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Tensor | None
-) -> _Problem:
+def _pose(robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Any) -> _Problem:
     cameras = cameras_of(proj)
-    batch = check_weights(*weighed, "pixels", pixels, "V N 2", proj.shape[:-3])
-    observed = observe(pixels, *weighed, batch)
+    weights, mask = weighed
+    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    observed = observe(pixels, weights, mask, batch)
     place = points.mT.to(observed.x.dtype).contiguous()
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below

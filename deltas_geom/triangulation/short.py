@@ -187,7 +187,7 @@ def _observed(
     share = size / largest
     finite = np.abs(seen).max(axis=-1) < _LIMIT**0.125  # NaN is not below
     if finite.all() and (share > NEGLIGIBLE_WEIGHT).all():
-        return seen, share, largest, everywhere, everywhere.any(axis=-1)
+        return seen, share, largest, everywhere, np.ones(everywhere.shape[:-1], dtype=bool)
     used = ~(size <= NEGLIGIBLE_WEIGHT * largest)
     counted = largest <= _LIMIT
     largest = np.where(counted & (largest > 0), largest, 1.0)

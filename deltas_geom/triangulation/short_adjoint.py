@@ -89,7 +89,7 @@ def _over_points(
         found = np.concatenate([weighed, last], axis=-1)
         return np.swapaxes(found.reshape(*found.shape[:-2], -1), -1, -2)
 
-    found = rows(error) @ push + rows(pushed) @ place
+    found: Array = rows(error) @ push + rows(pushed) @ place
     return found.reshape(*found.shape[:-2], -1, 3, 4)
 
 

@@ -1,7 +1,5 @@
 """The short way as its caller sees it: tensors in, tensors out."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -85,5 +83,5 @@ class ShortWay:
         return self._solved
 
     def _outward(self, values: Array) -> Tensor:
-        limit: Any = np.finfo(self.dtype).max
+        limit = float(np.finfo(self.dtype).max)  # type: ignore[type-var]
         return torch.from_numpy(np.clip(values, -limit, limit).astype(self.dtype))

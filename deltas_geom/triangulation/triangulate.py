@@ -1,16 +1,13 @@
 """Weighted, masked n-view DLT triangulation; every point carries a Status."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
-from deltas_geom.numerics.evaluation import (
-    Function,
-    WithAdjoint,
-    cut_points,
-    recomputed,
-    transformed,
-)
+from deltas_geom.numerics.chunks import cut_points
+from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, transformed
 from deltas_geom.triangulation.equations import Frame, Rig, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
@@ -151,12 +148,12 @@ class _Call:
     def points(self) -> Tensor:
         """Points ``(*B, N, 3)``."""
 
-        def derivable(proj: Tensor, *seen: Tensor | None) -> tuple[Tensor]:
+        def derivable(proj: Tensor, *seen: Any) -> tuple[Tensor]:
             way = self.long(rig_of(proj))
             return (way.outward(way.derive(way.see(*seen))[0]),)
 
         def adjoint(
-            gradients: tuple[Tensor], needed: tuple[bool, ...], *tensors: Tensor | None
+            gradients: tuple[Tensor], needed: tuple[bool, ...], *tensors: Any
         ) -> tuple[Tensor | None, ...]:
             found = self.way.adjoint(gradients[0], needed, *tensors[1:])
             return (*map(_shaped_as, found, tensors), None)
@@ -167,12 +164,12 @@ class _Call:
     def full(self, *, covariance: bool) -> Triangulation:
         """Points with all that is known about them."""
 
-        def derivable(proj: Tensor, *seen: Tensor | None) -> tuple[Tensor, ...]:
+        def derivable(proj: Tensor, *seen: Any) -> tuple[Tensor, ...]:
             way = self.long(rig_of(proj))
             equations = way.see(*seen)
             return way.described(equations, *way.derive(equations), covariance)
 
-        def values(_: Tensor, *seen: Tensor | None) -> tuple[Tensor, ...]:
+        def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
             return self.way.full(*seen, covariance=covariance)
 
         dims = (-2, -1, -1, -1, *([-3] if covariance else []), -1)

@@ -14,7 +14,8 @@ from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import check_bool, check_floating, check_shapes
 from deltas_geom.epipolar.fundamental import cross_matrix
 from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
-from deltas_geom.numerics.evaluation import cut_points, recomputed
+from deltas_geom.numerics.chunks import cut_points
+from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.status import Status
 from deltas_geom.triangulation.judge import judge
 

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from deltas_geom.numerics.chunks import values_at_hand
+from deltas_geom.numerics.arithmetic import values_at_hand
 
 LOWEST, HIGHEST = -1.0, 2.0
 """Resizing and noise overshoot [0, 1] a little; no other range of images stays within these."""

@@ -1,0 +1,81 @@
+"""Some points at a time: so few that what lies between stays in the cache, and no threads start."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.numerics.sums import SERIAL
+
+_CHUNK, _SMALLEST_CHUNK = 16384, 512  # points
+
+
+class Cut(NamedTuple):
+    """How a function of many points is computed some points at a time.
+
+    Attributes:
+        size: points at a time.
+        inputs: for each input the dim, from the end, along which it holds points; 0 if it is whole
+            in every chunk.
+        outputs: the same of each output.
+    """
+
+    size: int
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+
+
+def cut_points(
+    tensor: Tensor, *dims: int, outputs: tuple[int, ...], parts: bool = False
+) -> Cut | None:
+    """A cut for cameras and what is known of points, of which ``tensor`` ``(*B, V, N, K)`` tells N.
+
+    Args:
+        tensor: along whose second to last dim points lie. So few are taken at a time that no
+            operation on all their views starts threads.
+        *dims: of the inputs after the cameras.
+        outputs: of the outputs.
+        parts: will the function itself take some points at a time where it looks at views?
+    """
+    # A compiler fuses what lies between instead, and may not know the number of points.
+    if torch.compiler.is_compiling():
+        return None
+    few = serial_points(tensor)
+    whole = _CHUNK // max(1, tensor.shape[:-3].numel())
+    size = few * max(1, round(whole / few)) if parts else few
+    return Cut(_alike(tensor.shape[-2], size), (0, *dims), outputs)
+
+
+def serial_points(tensor: Tensor) -> int:
+    """How many points of ``(*B, V, N, K)`` all operations on their views compute in one thread."""
+    if torch.get_num_threads() == 1:
+        return _CHUNK
+    return max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
+
+
+def _alike(count: int, size: int) -> int:
+    """Points a chunk: a small one at the end would cost as many calls as a whole one."""
+    return max(1, -(-count // max(1, -(-count // size))))
+
+
+def chunks(
+    cut: Cut, tensors: Sequence[Tensor | None], dims: Sequence[int]
+) -> Iterator[tuple[Tensor | None, ...]]:
+    """The tensors of each chunk."""
+    count = next(t.shape[d] for t, d in zip(tensors, dims, strict=True) if t is not None and d)
+    for start in range(0, max(1, count), cut.size):
+        yield tuple(
+            t if t is None or d == 0 else t.narrow(d, start, min(cut.size, count - start))
+            for t, d in zip(tensors, dims, strict=True)
+        )
+
+
+def joined(parts: Sequence[Tensor], dim: int) -> Tensor:
+    """The parts as one tensor, copied in pieces for which no threads are started."""
+    if len(parts) == 1:
+        return parts[0]
+    few = max(1, SERIAL * parts[0].shape[dim] // max(1, parts[0].numel()))
+    if few < parts[0].shape[dim]:
+        parts = [piece for part in parts for piece in torch.split(part, few, dim)]
+    return torch.cat(list(parts), dim)
