@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+_NUMBERS = {str(number): number for number in range(10)}
 _CURES = {"ndarray": "torch.from_numpy({0})", "PosedViews": "{0}.proj, or a field of it"}
 
 
@@ -33,31 +34,39 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
         ...
         deltas_geom.checks.ShapeError: pixels must have shape (*B, N, 2), got (7, 3)
     """
-    seen: dict[str, tuple[int, str]] = {}
+    sizes = _NUMBERS.copy()
     for name, (tensor, spec) in named.items():
-        check_tensor(**{name: tensor})
-        if name not in ("mask", "used") and not name.endswith("_index"):
-            check_floating(**{name: tensor})
-        dims = spec.replace("+", "").split()
-        shape = tuple(tensor.shape)
-        tail = shape[len(shape) - len(dims) :] if len(shape) >= len(dims) else None
-        wrong = tail is None or any(
-            dim.isdigit() and int(dim) != size for dim, size in zip(dims, tail, strict=True)
-        )
-        if tail is None or wrong:
-            wanted = ", ".join(["*B", *dims])
-            raise ShapeError(f"{name} must have shape ({wanted}), got {shape}")
-        for dim, size in zip(dims, tail, strict=True):
-            if dim.isdigit():
-                continue
-            size_before, name_before = seen.setdefault(dim, (size, name))
-            if size == 0 and f"+{dim}" in spec:
-                raise ShapeError(f"{name} must have {dim} >= 1, got {shape}")
-            if size != size_before:
-                raise ShapeError(
-                    f"{name} has {dim} = {size} but {name_before} has {dim} = {size_before}; "
-                    f"{name} must have shape (*B, {', '.join(dims)}), got {shape}"
-                )
+        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+            check_tensor(**{name: tensor})
+            if name not in ("mask", "used") and not name.endswith("_index"):
+                check_floating(**{name: tensor})
+        dims, shape = spec.replace("+", "").split(), tensor.shape
+        tail = shape[-len(dims) :]
+        fits = len(tail) == len(dims)
+        for dim, size in zip(dims, tail, strict=False):
+            fits = fits and sizes.setdefault(dim, size) == size
+            fits = fits and (size > 0 or f"+{dim}" not in spec)
+        if not fits:
+            raise ShapeError(_misfit(named, name, sizes))
+
+
+def _misfit(named: dict[str, tuple[Tensor, str]], name: str, sizes: dict[str, int]) -> str:
+    """Why a tensor does not go with the sizes that those before it have."""
+    tensor, spec = named[name]
+    dims, shape = spec.replace("+", "").split(), tuple(tensor.shape)
+    tail, wanted = shape[-len(dims) :], f"must have shape (*B, {', '.join(dims)}), got {shape}"
+    if len(tail) < len(dims):
+        return f"{name} {wanted}"
+    pairs = list(zip(dims, tail, strict=True))
+    if any(dim in _NUMBERS and sizes[dim] != size for dim, size in pairs):
+        return f"{name} {wanted}"
+    for dim, size in pairs:
+        if size == 0 and f"+{dim}" in spec:
+            return f"{name} must have {dim} >= 1, got {shape}"
+        if size != sizes[dim]:
+            break
+    first = next(other for other, (_, its) in named.items() if dim in its.replace("+", "").split())
+    return f"{name} has {dim} = {size} but {first} has {dim} = {sizes[dim]}; {name} {wanted}"
 
 
 def check_tensor(**named: object) -> None:
@@ -97,14 +106,24 @@ def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:
     """The shape to which leading batch dims broadcast; raise ``ShapeError`` where they do not."""
     if torch.compiler.is_compiling():
         return torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
+    batches = {*shapes} - {()}
+    if len(batches) < 2:
+        return torch.Size(*batches)
     # Its first call imports a computer algebra system, which takes half a second.
-    most = max(map(len, shapes), default=0)
-    aligned = [(1,) * (most - len(shape)) + tuple(shape) for shape in shapes]
+    most = max(map(len, batches))
+    aligned = [(1,) * (most - len(shape)) + tuple(shape) for shape in batches]
     wanted = [{*sizes} - {1} for sizes in zip(*aligned, strict=True)]
     if any(len(sizes) > 1 for sizes in wanted):
         listed = ", ".join(str(tuple(shape)) for shape in shapes)
         raise ShapeError(f"leading batch dims must broadcast, got {listed}")
     return torch.Size(next(iter(sizes)) if sizes else 1 for sizes in wanted)
+
+
+def check_positive(**named: float) -> None:
+    """Raise ``ValueError`` unless every number is above 0."""
+    for name, value in named.items():
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}")
 
 
 def check_depth_range(depth_range: tuple[float, float]) -> None:

@@ -10,6 +10,7 @@ class Status(IntEnum):
     seen from where the cameras stand. AT_INFINITY: the rays are parallel. BEHIND_CAMERA: they meet
     behind a used camera. NOT_FINITE_INPUT: something used is NaN or infinite. EMPTY: nothing of the
     depth range is visible (segments). OUT_OF_RANGE: the depth is not within the range asked for.
+    RESIDUAL_TOO_LARGE: the views disagree by more than was asked for.
 
     Example:
         >>> print(Status.BEHIND_CAMERA.explanation)
@@ -24,6 +25,7 @@ class Status(IntEnum):
     NOT_FINITE_INPUT = 5
     EMPTY = 6
     OUT_OF_RANGE = 7
+    RESIDUAL_TOO_LARGE = 8
 
     @property
     def explanation(self) -> str:
@@ -57,5 +59,9 @@ _EXPLANATIONS = {
     Status.OUT_OF_RANGE: (
         "the rays meet nearer or farther than the depth range, or behind the view whose range it "
         "is: a match is wrong, or widen the range"
+    ),
+    Status.RESIDUAL_TOO_LARGE: (
+        "the views disagree about the point by more than the residual allowed: a match or a camera "
+        "is wrong; errors tells which view, diagnose tells why"
     ),
 }

@@ -44,7 +44,8 @@ def cut_points(
     few = serial_points(tensor)
     whole = _CHUNK // max(1, tensor.shape[:-3].numel())
     size = few * max(1, round(whole / few)) if parts else few
-    return Cut(_alike(tensor.shape[-2], size), (0, *dims), outputs)
+    count = tensor.shape[-2]
+    return Cut(_alike(count, size), (0, *dims), outputs) if count > size else None
 
 
 def serial_points(tensor: Tensor) -> int:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.numerics.ldl import Vector4
 from deltas_geom.triangulation.adjoint import gradients_of, weight_slope
@@ -23,7 +24,13 @@ from deltas_geom.triangulation.equations import (
 )
 from deltas_geom.triangulation.judge import judge, ok
 from deltas_geom.triangulation.observed import Observations, Vector3, in_parts
-from deltas_geom.triangulation.reprojection import in_views, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.reprojection import (
+    in_views,
+    mean_of,
+    parallax_of,
+    reproject,
+    squared_errors,
+)
 from deltas_geom.triangulation.solution import (
     FoundPoints,
     derivable_points,
@@ -74,6 +81,13 @@ class LongWay(NamedTuple):
         """The way for cameras; ``alike`` if there are neither weights nor a mask."""
         shared = alike_of(rig, frame, torch.finfo(dtype).eps) if alike else None
         return cls(rig, batch, frame, dtype, shared)
+
+    def solved(
+        self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Points in the solver's type and their status, without gradient."""
+        solved = self.solve(self.see(pixels, weights, mask))
+        return torch.stack(kept(solved.points, ok(solved.status)), dim=-1), solved.status
 
     def points(
         self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
@@ -150,21 +164,23 @@ class LongWay(NamedTuple):
             (px, py, weights), (x, y, z), valid = part, points, valid.unsqueeze(-2)
             used = ~weights.unused & valid
             found = reproject(cameras.proj, (x, y, z), used)
+            squared = squared_errors(found, px, py)
             outward: tuple[Tensor, ...] = (
                 found.depth if surely_all(valid) else torch.where(valid, found.depth, 0.0),
-                residual_of(found, px, py, weights.squared),
+                mean_of(squared, found.seen, weights.squared),
                 parallax_of(cameras.centers, (x, y, z), used.to(found.x.dtype)),
+                safe_sqrt(squared),
             )
             if covariance:
                 noise = covariance_of(cameras.proj, found, weights.squared)
                 outward = (*outward, *noise, weights.largest.squeeze(-2).expand_as(x))
             return outward
 
-        depth, residual, parallax, *noise = equations.each(seen, valid, *points)
+        depth, residual, parallax, errors, *noise = equations.each(seen, valid, *points)
         limit = torch.finfo(self.dtype).max
         described = tuple(
             tensor.to(self.dtype).clamp(-limit, limit)
-            for tensor in (torch.stack(points, dim=-1), depth, residual, parallax)
+            for tensor in (torch.stack(points, dim=-1), depth, residual, parallax, errors)
         )
         if covariance:
             xx, xy, xz, yy, yz, zz, largest = noise

@@ -129,7 +129,9 @@ def _triangulate(
     found = recomputed(solve, cameras, rays, weights, mask, cut=cut)
     points, depth, residual, parallax, status = found
     valid = status == Status.OK.value
-    return Triangulation(points, depth, status, valid, residual, parallax, None)
+    return Triangulation(
+        points, depth, status, valid, residual, parallax, None, torch.zeros_like(depth)
+    )
 
 
 class _Seen(NamedTuple):

@@ -116,7 +116,9 @@ def triangulate_rays(
     found = recomputed(derivable, cam_from_world, rays, weights, mask, values=values, cut=cut)
     points, depth, residual, parallax, status = found
     valid = status == Status.OK.value
-    return Triangulation(points, depth, status, valid, residual, parallax, None)
+    return Triangulation(
+        points, depth, status, valid, residual, parallax, None, torch.zeros_like(depth)
+    )
 
 
 class _Seen(NamedTuple):

@@ -52,14 +52,23 @@ def in_views(row: Tensor, points: Sequence[Tensor]) -> Tensor:
 
 def residual_of(found: Reprojection, x: Tensor, y: Tensor, squared: Tensor) -> Tensor:
     """Weighted RMS distance ``(*B, N)`` px from pixels, x and y ``(*B, V, N)``."""
+    return mean_of(squared_errors(found, x, y), found.seen, squared)
+
+
+def squared_errors(found: Reprojection, x: Tensor, y: Tensor) -> Tensor:
+    """Squared distances ``(*B, V, N)`` px^2 from pixels, x and y ``(*B, V, N)``; 0 if not seen."""
     dx, dy = found.x - x, found.y - y
     if not surely_all(found.seen):
         dx, dy = torch.where(found.seen, dx, 0.0), torch.where(found.seen, dy, 0.0)
-        squared = torch.where(found.seen, squared, 0.0)
-    errors = (torch.addcmul(dx * dx, dy, dy) * squared).sum(dim=-2)
-    total = squared.sum(dim=-2)
-    mean = safe_divide(errors, total, total > 0)
-    return safe_sqrt(mean)
+    return torch.addcmul(dx * dx, dy, dy)
+
+
+def mean_of(errors: Tensor, seen: Tensor, squared: Tensor) -> Tensor:
+    """Weighted RMS ``(*B, N)`` of squared errors ``(*B, V, N)``, with squared weights."""
+    if not surely_all(seen):
+        squared = torch.where(seen, squared, 0.0)
+    sums, total = (errors * squared).sum(dim=-2), squared.sum(dim=-2)
+    return safe_sqrt(safe_divide(sums, total, total > 0))
 
 
 @torch.no_grad()

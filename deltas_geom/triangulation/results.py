@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_bool, check_depth_range, check_shapes
+from deltas_geom.checks import check_bool, check_depth_range, check_positive, check_shapes
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 
@@ -22,6 +22,8 @@ class Triangulation(Record):
             None unless asked for; 0 if not valid, which does not mean exact. It is that of the
             least reprojection error, which one step of :func:`deltas_geom.refine_points` reaches;
             linear solutions scatter a little more.
+        errors: ``(*B, V, N)`` distance of each used view's projection from its pixel, px; 0 where
+            unused or not valid. It tells which view disagrees with the others.
     """
 
     points: Tensor
@@ -31,6 +33,23 @@ class Triangulation(Record):
     residual: Tensor
     parallax: Tensor
     covariance: Tensor | None
+    errors: Tensor
+
+    def within_residual(self, max_residual: float) -> "Triangulation":
+        """The same without the points about which the views disagree: RESIDUAL_TOO_LARGE.
+
+        They become 0 in every field, as all that failed, but for ``errors``, which tell which
+        view is wrong.
+
+        Args:
+            max_residual: px, or rad after :func:`deltas_geom.triangulate_rays` and its kin.
+
+        Raises:
+            ValueError: it is not positive.
+        """
+        check_positive(max_residual=max_residual)
+        kept = _without(self, self.residual > max_residual, Status.RESIDUAL_TOO_LARGE)
+        return kept._replace(errors=self.errors)
 
     def within_depth(
         self, depth_range: tuple[float, float], *, view: int = 0, used: Tensor | None = None
@@ -69,7 +88,7 @@ class Triangulation(Record):
             check_shapes(depth=(self.depth, "V N"), used=(used, "V N"))
             check_bool(used=used)
             outside = (_beyond(self.depth, depth_range) & used).any(dim=-2)
-        return _without(self, outside)
+        return _without(self, outside, Status.OUT_OF_RANGE)
 
 
 class RobustTriangulation(Record):
@@ -83,6 +102,7 @@ class RobustTriangulation(Record):
         residual: ``(*B, N)`` weighted RMS distance, px.
         parallax: ``(*B, N)`` largest angle, rad.
         covariance: ``(*B, N, 3, 3)`` m^2; None unless asked for.
+        errors: ``(*B, V, N)`` px, of the inliers.
         inliers: ``(*B, V, N)`` bool, the views used; none if not valid.
     """
 
@@ -93,14 +113,21 @@ class RobustTriangulation(Record):
     residual: Tensor
     parallax: Tensor
     covariance: Tensor | None
+    errors: Tensor
     inliers: Tensor
+
+    def within_residual(self, max_residual: float) -> "RobustTriangulation":
+        """As :meth:`Triangulation.within_residual`, of the inliers."""
+        return self._kept(Triangulation(*self[:-1]).within_residual(max_residual))
 
     def within_depth(self, depth_range: tuple[float, float]) -> "RobustTriangulation":
         """As :meth:`Triangulation.within_depth`, the range being that of every inlier."""
         found = Triangulation(*self[:-1])
-        kept = found.within_depth(depth_range, used=self.inliers)
-        inliers = self.inliers & kept.valid.unsqueeze(-2)
-        return RobustTriangulation(**kept._asdict(), inliers=inliers)
+        return self._kept(found.within_depth(depth_range, used=self.inliers))
+
+    def _kept(self, found: Triangulation) -> "RobustTriangulation":
+        inliers = self.inliers & found.valid.unsqueeze(-2)
+        return RobustTriangulation(**found._asdict(), inliers=inliers)
 
 
 def _beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
@@ -109,16 +136,17 @@ def _beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
     return (depth < near) | (depth > far)
 
 
-def _without(found: Triangulation, outside: Tensor) -> Triangulation:
-    """The same, with those of ``(*B, N)`` that were valid OUT_OF_RANGE."""
+def _without(found: Triangulation, outside: Tensor, reason: Status) -> Triangulation:
+    """The same, with those of ``(*B, N)`` that were valid failed for a reason."""
     outside = found.valid & outside
     cov = found.covariance
     return Triangulation(
         points=torch.where(outside[..., None], 0.0, found.points),
         depth=torch.where(outside[..., None, :], 0.0, found.depth),
-        status=torch.where(outside, Status.OUT_OF_RANGE.value, found.status),
+        status=torch.where(outside, reason.value, found.status),
         valid=found.valid & ~outside,
         residual=torch.where(outside, 0.0, found.residual),
         parallax=torch.where(outside, 0.0, found.parallax),
         covariance=None if cov is None else torch.where(outside[..., None, None], 0.0, cov),
+        errors=torch.where(outside[..., None, :], 0.0, found.errors),
     )

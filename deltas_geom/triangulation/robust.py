@@ -9,14 +9,17 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import to_homogeneous
-from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, without_autocast
+from deltas_geom.numerics.sums import product
 from deltas_geom.status import Status
+from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.results import RobustTriangulation
-from deltas_geom.triangulation.triangulate import triangulate, triangulate_points
+from deltas_geom.triangulation.triangulate import Call, KnownCameras
 from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 _BUDGET = 2**17  # distances at a time: what lies between stays in the cache
+_ROUNDS = 3  # of improving the inliers by their own point; the first settles nearly all
 
 
 @without_autocast
@@ -36,7 +39,9 @@ def triangulate_robust(
     Candidates are the point of all views and that of each pair of views. The best has the
     smallest cost :math:`\sum_v w_v^2 \min(\|e_v\|^2, t^2)` over the used views, e the distance in
     pixels and t the threshold; a view behind which the point lies pays in full. The views within
-    the threshold are triangulated; the result is a last candidate.
+    the threshold are triangulated; the result is a last candidate. Inliers are within the
+    threshold of the point returned: where the weighted point of the views that agree leaves one
+    of them, the point is refused.
 
     Two views confirm each other little: a wrong match near the epipolar line agrees too, and of
     two that disagree both are rejected. ``min_inliers=3`` asks for a third to confirm. With two
@@ -87,14 +92,15 @@ def triangulate_robust(
         raise ValueError(f"max_pairs must be 1 or more, got {max_pairs}")
 
     with torch.no_grad():
+        known = KnownCameras(proj)
         observed = _observe(proj, pixels, weights, mask)
         chunk = max(1, min(8192, _BUDGET // max(1, observed.usable.shape[:-1].numel())))
         parts = [
-            _consensus(observed.some(start, chunk), threshold, min_inliers, max_pairs)
+            _consensus(known, observed.some(start, chunk), threshold, min_inliers, max_pairs)
             for start in range(0, max(1, pixels.shape[-2]), chunk)
         ]
         inliers, reason = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
-    found = triangulate(proj, pixels, weights, inliers, covariance=covariance)
+    found = Call(known, pixels, weights, inliers, "rig").full(covariance=covariance)
     status = torch.where(inliers.any(dim=-2), found.status, reason)
     inliers = inliers & found.valid.unsqueeze(-2)
     return RobustTriangulation(**found._replace(status=status)._asdict(), inliers=inliers)
@@ -168,64 +174,96 @@ def _observe(
     )
 
 
-_Best = tuple[Tensor, Tensor]
-"""Inliers ``(*B, V, N)`` of the best candidates, and their cost ``(*B, N)`` px^2, inf if none."""
+class _Best(NamedTuple):
+    """The best candidates.
+
+    Attributes:
+        inliers: ``(*B, V, N)`` bool.
+        cost: ``(*B, N)`` px^2, infinite where there is none.
+    """
+
+    inliers: Tensor
+    cost: Tensor
+
+    def or_cheaper(self, other: "_Best") -> "_Best":
+        """Where the other is cheaper, that one."""
+        cheaper = other.cost < self.cost
+        inliers = torch.where(cheaper.unsqueeze(-2), other.inliers, self.inliers)
+        return _Best(inliers, torch.where(cheaper, other.cost, self.cost))
 
 
 def _consensus(
-    observed: _Observations, threshold: float, min_inliers: int, max_pairs: int
+    known: KnownCameras,
+    observed: _Observations,
+    threshold: float,
+    min_inliers: int,
+    max_pairs: int,
 ) -> tuple[Tensor, Tensor]:
     """Inliers ``(*B, V, N)``, and where there are none the status that says why ``(*B, N)``."""
+    seen = observed.pixels, observed.weights
 
-    def judge(points: Tensor, exist: Tensor) -> _Best:
+    def solved(used: Tensor) -> tuple[Tensor, Tensor]:
+        points, status = Call(known, *seen, used, "rig").solved()
+        return points.mT.unsqueeze(-2), status
+
+    def judged(points: Tensor, exist: Tensor) -> _Best:
         return _judge(observed, points, exist, threshold, min_inliers)
 
-    seen = observed.proj, observed.pixels, observed.weights
-    plain = triangulate(*seen, observed.usable)
-    best = judge(plain.points.mT.unsqueeze(-2), plain.valid.unsqueeze(-2))
+    points, status = solved(observed.usable)
+    best = judged(points, ok(status).unsqueeze(-2))
     pairs = _pairs(observed.usable, max_pairs)
     at_once = max(1, _BUDGET // max(1, observed.usable.numel()))
     for start in range(0, pairs[0].shape[-2], at_once):
         some = (tensor[..., start : start + at_once, :] for tensor in pairs)
-        best = _better(best, judge(*_pair_points(observed, *some)))
-    # The better point finds inliers that a pair's noise had hidden; a second time it finds none.
-    again = triangulate_points(*seen, best[0])
-    # Points that failed are 0. One that lies there in truth merely stays as it is.
-    there = (again != 0).any(dim=-1).unsqueeze(-2)
-    inliers, _ = _better(best, judge(again.mT.unsqueeze(-2), there))
-    reason = torch.where(plain.valid, int(Status.TOO_FEW_VIEWS), plain.status)
+        best = best.or_cheaper(judged(*_pair_points(observed, *some)))
+    agree = best.inliers
+    for _ in range(_ROUNDS):
+        # The better point finds inliers that a pair's noise had hidden, or loses some.
+        points, again = solved(best.inliers)
+        agree = _distances(observed, points)[0].squeeze(-2) < threshold**2
+        before = best
+        best = best.or_cheaper(judged(points, ok(again).unsqueeze(-2)))
+        if surely_all(best.inliers == before.inliers):
+            break
+    # An inlier is within the threshold of the point that the inliers have, or there are none.
+    true = (agree | ~best.inliers).all(dim=-2, keepdim=True)
+    reason = torch.where(ok(status), int(Status.TOO_FEW_VIEWS), status)
     explained = observed.finite | (observed.usable.sum(dim=-2) >= 2)
-    return inliers, torch.where(explained, reason, int(Status.NOT_FINITE_INPUT))
+    return best.inliers & true, torch.where(explained, reason, int(Status.NOT_FINITE_INPUT))
 
 
-def _better(one: _Best, other: _Best) -> _Best:
-    """The cheaper of two, the first if they are equal."""
-    cheaper = other[1] < one[1]
-    inliers = torch.where(cheaper.unsqueeze(-2), other[0], one[0])
-    return inliers, torch.where(cheaper, other[1], one[1])
+def _distances(observed: _Observations, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared distances ``(*B, V, C, N)`` px^2 of candidates ``(*B, 3, C, N)``; do these exist?
+
+    Infinite behind a view, and of what is too far to exist.
+    """
+    exist = (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(dim=-3)
+    if not surely_all(exist):
+        points = torch.where(exist.unsqueeze(-3), points, 0.0)
+    views, shape = observed.usable.shape[-2], points.shape[-2:]
+    rows = observed.proj.flatten(-3, -2)  # (*B, 3 V, 4): one product for all
+    seen = product(rows[..., :3], points.flatten(-2)) + rows[..., 3:]
+    x, y, z = seen.reshape(*seen.shape[:-2], views, 3, *shape).unbind(dim=-3)
+    in_front = z > torch.finfo(z.dtype).tiny ** 0.25
+    everywhere = surely_all(in_front)
+    inverse = z.reciprocal() if everywhere else 1 / torch.where(in_front, z, 1.0)
+    u, v = observed.pixels.unsqueeze(-3).unbind(dim=-1)
+    distance = (x * inverse - u).square() + (y * inverse - v).square()
+    return distance if everywhere else torch.where(in_front, distance, torch.inf), exist
 
 
 def _judge(
     observed: _Observations, points: Tensor, exist: Tensor, threshold: float, min_inliers: int
 ) -> _Best:
     """The best of the candidates ``(*B, 3, C, N)`` of each point, if any exist ``(*B, C, N)``."""
-    exist = exist & (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(dim=-3)
-    points = torch.where(exist.unsqueeze(-3), points, 0.0)
-    views, shape = observed.usable.shape[-2], points.shape[-2:]
-    proj = observed.proj.flatten(-3, -2)  # (*B, 3 V, 4): one product for all
-    seen = proj[..., :3] @ points.flatten(-2) + proj[..., 3:]
-    x, y, z = seen.reshape(*seen.shape[:-2], views, 3, *shape).unbind(dim=-3)
-    in_front = z > torch.finfo(z.dtype).tiny ** 0.25
-    inverse = 1 / torch.where(in_front, z, 1.0)
-    u, v = observed.pixels.unsqueeze(-3).unbind(dim=-1)
-    distance = (x * inverse - u).square() + (y * inverse - v).square()  # (*B, V, C, N)
-    distance = torch.where(in_front, distance, torch.inf).clamp(max=threshold**2)
+    distance, representable = _distances(observed, points)
+    distance = distance.clamp(max=threshold**2)
     agree = observed.usable.unsqueeze(-2) & (distance < threshold**2)
     cost = (observed.weights.square().unsqueeze(-2) * distance).sum(dim=-3)
-    cost = torch.where(exist & (agree.sum(dim=-3) >= min_inliers), cost, torch.inf)
-    cheapest, index = cost.min(dim=-2, keepdim=True)
+    possible = exist & representable & (agree.sum(dim=-3) >= min_inliers)
+    cheapest, index = torch.where(possible, cost, torch.inf).min(dim=-2, keepdim=True)
     inliers = torch.take_along_dim(agree, index.unsqueeze(-3), dim=-2).squeeze(-2)
-    return inliers & cheapest.isfinite(), cheapest.squeeze(-2)
+    return _Best(inliers & cheapest.isfinite(), cheapest.squeeze(-2))
 
 
 def _pairs(usable: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -249,8 +249,11 @@ def _judged(finite: Array, enough: Array, posed: Array, near: Array, ahead: Arra
     return status
 
 
-def describe(rig: ShortRig, solved: Solved) -> tuple[Array, Array, Array]:
-    """Depth ``(*B, V, N)``, residual px and parallax rad ``(*B, N)``; 0 where not valid."""
+def describe(rig: ShortRig, solved: Solved) -> tuple[Array, Array, Array, Array]:
+    """Depth ``(*B, V, N)``, residual px, parallax rad ``(*B, N)``, errors px ``(*B, V, N)``.
+
+    All are 0 where a point is not valid.
+    """
     with np.errstate(all="ignore"):
         valid = (solved.status == 0)[..., None]
         depth = np.where(valid, solved.depth, 0.0)
@@ -261,14 +264,16 @@ def describe(rig: ShortRig, solved: Solved) -> tuple[Array, Array, Array]:
         pixels = (rows[..., 0] + place[..., None, :, :2, 3]) / depth[..., None]
         offset = np.where(seen[..., None], pixels - solved.pixels, 0.0)
         squared = np.where(seen, solved.share * solved.share, 0.0)
-        errors = (squared * (offset * offset).sum(axis=-1)).sum(axis=-1)
+        apart = (offset * offset).sum(axis=-1)
+        sums = (squared * apart).sum(axis=-1)
         total = squared.sum(axis=-1)
-        residual = np.sqrt(np.where(total > 0, errors / total, 0.0))
+        residual = np.sqrt(np.where(total > 0, sums / total, 0.0))
         rays = from_datum[..., None, :] - rig.offset[..., None, :, :]
         length = np.sqrt((rays * rays).sum(axis=-1, keepdims=True))
         rays = np.where(length > 0, rays / length, 0.0)
         used = solved.used & valid
-        apart = rays[..., None, :, :] - rays[..., :, None, :]
-        chords = (apart * apart).sum(axis=-1) * (used[..., None, :] & used[..., :, None])
+        chord = rays[..., None, :, :] - rays[..., :, None, :]
+        chords = (chord * chord).sum(axis=-1) * (used[..., None, :] & used[..., :, None])
         parallax = 2 * np.arcsin(np.minimum(0.5 * np.sqrt(chords.max(axis=(-2, -1))), 1.0))
-        return np.swapaxes(depth, -1, -2), residual, parallax
+        errors = np.swapaxes(np.sqrt(apart), -1, -2)
+        return np.swapaxes(depth, -1, -2), residual, parallax, errors

@@ -25,6 +25,13 @@ class ShortWay:
         self.dtype = np.dtype(np.float64 if dtype == torch.float64 else np.float32)
         self._solved: Solved | None = None
 
+    def solved(
+        self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Points in float64 and their status, without gradient."""
+        solved = self._solve(pixels, weights, mask)
+        return torch.from_numpy(solved.points), torch.from_numpy(solved.status)
+
     def points(
         self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
     ) -> tuple[Tensor, ...]:
@@ -84,4 +91,4 @@ class ShortWay:
 
     def _outward(self, values: Array) -> Tensor:
         limit = float(np.finfo(self.dtype).max)  # type: ignore[type-var]
-        return torch.from_numpy(np.clip(values, -limit, limit).astype(self.dtype))
+        return torch.from_numpy(np.minimum(np.maximum(values, -limit), limit).astype(self.dtype))

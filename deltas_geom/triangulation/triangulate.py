@@ -30,7 +30,7 @@ def triangulate_points(
 
     (0, 0, 0) stands for no answer, and may be one.
     """
-    return _Call(KnownCameras(proj), pixels, weights, mask, frame).points()
+    return Call(KnownCameras(proj), pixels, weights, mask, frame).points()
 
 
 @without_autocast
@@ -42,6 +42,7 @@ def triangulate(
     *,
     frame: Frame = "rig",
     covariance: bool = False,
+    max_residual: float | None = None,
 ) -> Triangulation:
     """Triangulate matched pixels of V views by weighted DLT, differentiably.
 
@@ -54,6 +55,8 @@ def triangulate(
         frame: "rig" solves in each point's rig frame; "world" in the frame of ``proj``, as
             OpenCV and kornia do, whose answer depends on the world's origin and unit.
         covariance: also compute the covariance of the points.
+        max_residual: px; points about which the views disagree by more are RESIDUAL_TOO_LARGE.
+            Pixels handed over as (N, V, 2) where N = V have residuals of many pixels, too.
 
     Returns:
         Points with status, in the dtype of ``proj``. Nothing raises or turns NaN because of values.
@@ -61,6 +64,7 @@ def triangulate(
     Raises:
         ShapeError: a trailing shape differs, or there is no view.
         TypeError: ``proj`` is not floating point, or the mask not bool.
+        ValueError: ``max_residual`` is not positive.
 
     Source: Hartley and Zisserman, 2nd ed., section 12.2; weights as in the paper, section
     3.2, after Iskakov et al. (2019).
@@ -74,8 +78,9 @@ def triangulate(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.0000, 2.0000]])
     """
-    call = _Call(KnownCameras(proj), pixels, weights, mask, frame)
-    return call.full(covariance=covariance)
+    call = Call(KnownCameras(proj), pixels, weights, mask, frame)
+    found = call.full(covariance=covariance)
+    return found if max_residual is None else found.within_residual(max_residual)
 
 
 _PLAIN = (torch.float32, torch.float64, torch.bool)  # NumPy has no bfloat16
@@ -106,7 +111,7 @@ class KnownCameras:
         return self._long
 
 
-class _Call:
+class Call:
     """One triangulation: how it is computed, and how it is derived.
 
     Args:
@@ -129,7 +134,7 @@ class _Call:
             raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
         proj = known.proj
         self.batch = check_observed(proj, pixels, weights, mask)
-        self.tensors = (proj, pixels, weights, mask)
+        self.tensors: tuple[Any, ...] = (proj, pixels, weights, mask)
         self.known, self.frame, self.dtype = known, frame, proj.dtype
         self.alike = weights is None and mask is None
         # What a compiler, a transform or another device holds has no values to look at.
@@ -144,6 +149,11 @@ class _Call:
     def long(self, rig: Rig) -> LongWay:
         """The long way by these cameras."""
         return LongWay.of(rig, self.batch, self.frame, self.dtype, alike=self.alike)
+
+    def solved(self) -> tuple[Tensor, Tensor]:
+        """Points ``(*B, N, 3)`` in the solver's type and their status, without gradient."""
+        with torch.no_grad():
+            return self.way.solved(*self.tensors[1:])
 
     def points(self) -> Tensor:
         """Points ``(*B, N, 3)``."""
@@ -172,18 +182,16 @@ class _Call:
         def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
             return self.way.full(*seen, covariance=covariance)
 
-        dims = (-2, -1, -1, -1, *([-3] if covariance else []), -1)
-        points, depth, residual, parallax, *noise, status = self._computed(derivable, values, dims)
-        return Triangulation(
-            points, depth, status, ok(status), residual, parallax, noise[0] if noise else None
-        )
+        dims = (-2, -1, -1, -1, -1, *([-3] if covariance else []), -1)
+        found = self._computed(derivable, values, dims)
+        points, depth, residual, parallax, errors, *noise, status = found
+        cov = noise[0] if noise else None
+        return Triangulation(points, depth, status, ok(status), residual, parallax, cov, errors)
 
     def _computed(
         self, function: Function, values: Function, outputs: tuple[int, ...]
     ) -> tuple[Tensor, ...]:
-        pixels = self.tensors[1]
-        assert pixels is not None
-        cut = cut_points(pixels, -2, -1, -1, outputs=outputs, parts=True)
+        cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs, parts=True)
         return recomputed(function, *self.tensors, values=values, cut=cut)
 
 

@@ -74,7 +74,9 @@ def test_a_record_moves_and_prints_as_a_tensor(record: Any) -> None:
 def test_a_record_prints_how_many_there_are_of_each_status() -> None:
     ones = torch.ones(3)
     status = torch.tensor([0, 4, 0], dtype=torch.int8)
-    points = geom.Triangulation(torch.ones(3, 3), ones[None], status, status == 0, ones, ones, None)
+    points = geom.Triangulation(
+        torch.ones(3, 3), ones[None], status, status == 0, ones, ones, None, ones[None]
+    )
     assert repr(points) == (
         "Triangulation(points (3, 3), depth (1, 3), status (3,) 2 OK 1 BEHIND_CAMERA, "
         "valid (3,) 2 True, residual (3,), parallax (3,), covariance None) float32 cpu"
