@@ -7,16 +7,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
+from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3, solve3
 from deltas_geom.testing.strategies import extreme, scales, vectors
-from deltas_geom.triangulation.dlt import (
-    Symmetric3,
-    _by_views,
-    alike_coefficients,
-    alike_normal_matrix,
-    inverse3,
-    normal_matrix,
-    solve3,
-)
+from deltas_geom.triangulation.dlt import _by_views, normal_coefficients, normal_matrix, rows
 from deltas_geom.triangulation.uncertainty import unpacked3
 
 EPS = torch.finfo(torch.float64).eps
@@ -58,28 +51,34 @@ def definite(draw: st.DrawFn, *, decades: float = 3.0) -> Tensor:
 @pytest.mark.parametrize("columns", [3, 4])
 def test_it_is_the_square_of_the_rows(columns: int, drawn: tuple[Tensor, ...]) -> None:
     proj, x, y, squared = drawn
-    rows = rows_of(proj[..., :columns], x, y, squared)
-    wanted = rows.mT @ rows
-    found = normal_matrix(proj[..., :columns], x, y, squared)
+    equations = rows_of(proj[..., :columns], x, y, squared)
+    wanted = equations.mT @ equations
+    found = normal_matrix(normal_coefficients(proj[..., :columns]), x, y, squared)
+    alike = normal_matrix(normal_coefficients(proj[..., :columns]), x, y, squared[:, :1])
     upper = torch.triu_indices(columns, columns)
     assert len(found) == columns * (columns + 1) // 2
     assert_close(torch.stack(found, dim=-1), wanted[:, upper[0], upper[1]], rtol=0, atol=1e-12)
+    equations = rows_of(proj[..., :columns], x, y, squared[:, :1].expand_as(x))
+    wanted = equations.mT @ equations
+    assert_close(torch.stack(alike, dim=-1), wanted[:, upper[0], upper[1]], rtol=0, atol=1e-12)
+
+
+@given(drawn=seen())
+def test_the_rows_are_the_books(drawn: tuple[Tensor, ...]) -> None:
+    proj, x, y, squared = drawn
+    seen = torch.stack([x, y], dim=-1).transpose(0, 1)  # (N, V, 2)
+    found = rows(proj, seen, squared.sqrt().mT)
+    assert_close(found, rows_of(proj, x, y, squared), rtol=0, atol=1e-14)
+    assert_close(rows(proj, seen), rows_of(proj, x, y, torch.ones_like(x)), rtol=0, atol=1e-14)
 
 
 @given(drawn=seen(), factor=scales(decades=20))
 def test_squared_weights_multiply_it(drawn: tuple[Tensor, ...], factor: float) -> None:
-    *known, squared = drawn
-    found = torch.stack(normal_matrix(*known, factor * squared))
-    assert_close(found / factor, torch.stack(normal_matrix(*known, squared)), rtol=0, atol=1e-12)
-
-
-@given(drawn=seen())
-def test_it_may_be_prepared_where_all_points_weigh_the_same(drawn: tuple[Tensor, ...]) -> None:
     proj, x, y, squared = drawn
-    wanted = torch.stack(normal_matrix(proj, x, y, squared[:, :1]))
-    coefficients = alike_coefficients(proj, squared[:, :1])
-    found = torch.stack(alike_normal_matrix(coefficients, torch.stack([x, y], dim=-2)))
-    assert_close(found, wanted, rtol=0, atol=1e-12)
+    coefficients = normal_coefficients(proj)
+    found = torch.stack(normal_matrix(coefficients, x, y, factor * squared))
+    wanted = torch.stack(normal_matrix(coefficients, x, y, squared))
+    assert_close(found / factor, wanted, rtol=0, atol=1e-12)
 
 
 @given(matrix=definite(decades=100), x=vectors(1, within=2.0))
@@ -174,19 +173,19 @@ def test_batches_broadcast_cameras_against_points() -> None:
     generator = torch.Generator().manual_seed(0)
     proj = torch.randn(5, 1, 2, 3, 4, generator=generator).double()
     x, y, squared = torch.rand(3, 6, 2, 7, generator=generator).double()
-    found = normal_matrix(proj, x, y, squared)
+    found = normal_matrix(normal_coefficients(proj), x, y, squared)
     assert all(entry.shape == (5, 6, 7) for entry in found)
-    one = normal_matrix(proj[3, 0], x[4], y[4], squared[4])
+    one = normal_matrix(normal_coefficients(proj[3, 0]), x[4], y[4], squared[4])
     for entry, wanted in zip(found, one, strict=True):
         assert_close(entry[3, 4], wanted)
 
 
-@pytest.mark.parametrize("rows", [3, 4])
-def test_view_by_view_it_is_the_product(rows: int) -> None:
+@pytest.mark.parametrize("columns", [3, 4])
+def test_view_by_view_it_is_the_product(columns: int) -> None:
     random = torch.Generator().manual_seed(5)
-    proj = torch.randn(2, 3, 3, rows, generator=random, dtype=torch.float64)
+    proj = torch.randn(2, 3, 3, columns, generator=random, dtype=torch.float64)
     x, y = torch.randn(2, 2, 3, 7, generator=random, dtype=torch.float64)
     for count in (7, 1):  # weights of each point, or of all
         squared = torch.rand(2, 3, count, generator=random, dtype=torch.float64)
-        found, expected = _by_views(proj, x, y, squared), normal_matrix(proj, x, y, squared)
-        assert_close(torch.stack(found), torch.stack(expected))
+        seen = normal_coefficients(proj), x, y, squared
+        assert_close(torch.stack(_by_views(*seen)), torch.stack(normal_matrix(*seen)))

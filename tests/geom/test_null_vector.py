@@ -12,11 +12,7 @@ from deltas_geom.numerics.ldl import (
     Symmetric4,
     Vector4,
     dot,
-    factor,
-    factor_columns,
     multiply,
-    shifted,
-    shifted_factors,
     unit,
 )
 from deltas_geom.numerics.null_vector import NullVector, null_vector, rayleigh_step
@@ -215,70 +211,35 @@ def test_easy_and_hard_ones_together_are_as_each_alone() -> None:
             assert_close(found.reshape(500, 4)[number], wanted, rtol=0, atol=1e-15)
 
 
-@st.composite
-def tall(draw: st.DrawFn) -> Tensor:
-    """Rows ``(6, 4)`` with singular values of 0.5 to 3.2."""
-    rows = torch.eye(6, 4, dtype=torch.float64) * 2 + draw(vectors(6, within=0.3, size=4))
-    return rows * torch.tensor([1.0, 0.7, 1.2, 0.9]).double()
-
-
-@given(rows=tall(), share=st.floats(-1.0, 0.9))
-def test_factors_by_columns_and_their_shifts_are_those_of_the_matrix(
-    rows: Tensor, share: float
-) -> None:
-    matrix = packed((rows.mT @ rows).unsqueeze(0))
-    factors = factor_columns(of(rows.unsqueeze(-2)))
-    assert_close(factors, factor(matrix), rtol=1e-12, atol=1e-13)
-    # Up to the smallest eigenvalue, where the matrix is no longer definite.
-    shift = share * torch.linalg.svdvals(rows)[-1] ** 2
-    wanted = factor(shifted(matrix, shift))
-    assert_close(shifted_factors(factors.pivots, shift), wanted, rtol=1e-11, atol=1e-12)
-
-
-def forgotten_by_the_square(
-    count: int, *, views: int, share: float, dtype: torch.dtype = torch.float64
-) -> Tensor:
-    """Rows ``(count, 2 views, 4)`` whose two smallest singular values are about 1e-10 and
-    ``share`` of it: the square of the largest, times rounding, is a million times theirs.
-    """
-    random = torch.Generator().manual_seed(3)
-    rows = torch.randn(count, 2 * views, 4, generator=random, dtype=torch.float64)
-    left, _, right = torch.linalg.svd(rows, full_matrices=False)
-    values = torch.tensor([1.0, 0.3, 1e-10, share * 1e-10], dtype=torch.float64)
-    return ((left * values) @ right).to(dtype)
-
-
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.8])
 @pytest.mark.parametrize("views", [2, 5])
-def test_by_columns_the_vector_is_as_exact_as_an_svd_of_them(views: int, share: float) -> None:
-    rows = forgotten_by_the_square(2000, views=views, share=share)
-    columns = of(rows.permute(1, 0, 2))
-    with_columns = null_vector(packed(rows.mT @ rows), columns=columns).vector
-    without = null_vector(packed(rows.mT @ rows)).vector
+def test_polished_by_its_rows_the_vector_is_as_exact_as_an_svd_of_them(
+    views: int, share: float
+) -> None:
+    # Of the two smallest singular values, 1e-5 and a share of it, the square keeps six digits.
+    random = torch.Generator().manual_seed(3)
+    drawn = torch.randn(2000, 2 * views, 4, generator=random, dtype=torch.float64)
+    left, _, right = torch.linalg.svd(drawn, full_matrices=False)
+    values = torch.tensor([1.0, 0.3, 1e-5, share * 1e-5], dtype=torch.float64)
+    rows = (left * values) @ right
     smallest = torch.linalg.svd(rows).Vh[:, 3]
+
+    def product(x: Vector4) -> Vector4:
+        return of((rows.mT @ (rows @ torch.stack(x, dim=-1).unsqueeze(-1))).squeeze(-1))
 
     def error(vector: Vector4) -> Tensor:
         found = torch.stack(unit(vector), dim=-1)
         return (found - smallest * (found * smallest).sum(dim=-1, keepdim=True)).norm(dim=-1)
 
+    polished, simple = null_vector(packed(rows.mT @ rows), product=product, polish=2)
+    plain = null_vector(packed(rows.mT @ rows)).vector
     # The rounding of the rows turns the vector by so much, whoever computes it.
-    rounding = torch.finfo(rows.dtype).eps / (1e-10 * (1 - share))
-    assert error(with_columns).median() <= 3 * rounding
-    # The square knows nothing here. One start in thousands is the wrong vector, to which the
-    # iterations then stay.
-    assert error(with_columns).quantile(0.998) <= 30 * rounding
-    assert error(without).median() >= 1000 * rounding
-
-
-def test_columns_may_be_of_any_batch() -> None:
-    rows = forgotten_by_the_square(12, views=3, share=0.1)
-    matrix = rows.mT @ rows
-    alone = null_vector(packed(matrix), columns=of(rows.permute(1, 0, 2)))
-    batch = null_vector(
-        packed(matrix.reshape(3, 4, 4, 4)), columns=of(rows.reshape(3, 4, 6, 4).transpose(1, 2))
-    )
-    for component, wanted in zip(batch.vector, alone.vector, strict=True):
-        assert_close(component.flatten(), wanted)
+    rounding = torch.finfo(rows.dtype).eps / (1e-5 * (1 - share))
+    # One start in a hundred ends at the wrong vector, and is told.
+    assert simple.double().mean() > 0.98
+    assert error(polished)[simple].max() <= 30 * rounding
+    assert error(polished)[simple].median() <= rounding
+    assert error(plain).median() >= 1000 * rounding
 
 
 @pytest.mark.parametrize("num_views", [2, 8])

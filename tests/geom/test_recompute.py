@@ -1,12 +1,15 @@
 """Functions that keep only their inputs for backward."""
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.numerics.evaluation import WithLagrangian, recomputed
+from deltas_geom.numerics.chunks import Cut
+from deltas_geom.numerics.evaluation import WithAdjoint, recomputed
 from deltas_geom.testing.strategies import vectors
 
 
@@ -216,50 +219,65 @@ def root(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
     return r, r.detach().clone(), r > 0
 
 
-def implicit(found: tuple[Tensor, ...], gradient: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    r, positive = found
-    assert not r.requires_grad and positive.dtype == torch.bool
-    multiplier = gradient / (3 * r * r + y.detach() ** 2)
-    return -multiplier * (y * y * r - x)
+def implicit(
+    gradients: tuple[Tensor, ...], needed: tuple[bool, ...], x: Tensor, y: Tensor
+) -> tuple[Tensor | None, ...]:
+    """From the equation: dr (3 r^2 + y^2) = dx - 2 y r dy."""
+    r = root(x, y)[0]
+    of_x = gradients[0] / (3 * r * r + y * y)
+    return tuple(
+        g if asked else None for g, asked in zip((of_x, -2 * y * r * of_x), needed, strict=True)
+    )
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_a_lagrangian_gives_the_gradient_in_place_of_the_function(compiled: bool) -> None:
+@pytest.mark.parametrize("cut", [None, Cut(2, (-1, -1), (-1, -1, -1))], ids=["whole", "cut"])
+def test_an_adjoint_gives_the_gradient_in_place_of_the_function(
+    cut: Cut | None, compiled: bool
+) -> None:
     numbers = torch.rand(2, 5, generator=torch.Generator().manual_seed(0)).double() + 0.5
     x, y = leaves(numbers)
 
     def solve(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        return recomputed(WithLagrangian(root, implicit), x, y)
+        return recomputed(WithAdjoint(root, implicit), x, y, cut=None if compiled else cut)
 
     found = (torch.compile(solve, fullgraph=True, backend="aot_eager") if compiled else solve)(x, y)
+    assert [out.requires_grad for out in found] == [True, False, False]
     for ours, theirs in zip(found, root(x, y), strict=True):
         assert_close(ours, theirs)
     share = torch.arange(5.0).double()
-    ours = torch.autograd.grad((share * found[0]).sum(), (x, y))
-    for a, b in zip(ours, torch.autograd.grad((share * root(x, y)[0]).sum(), (x, y)), strict=True):
+    wanted = torch.autograd.grad((share * root(x, y)[0]).sum(), (x, y))
+    ours = torch.autograd.grad((share * found[0]).sum(), (x, y), retain_graph=True)
+    for a, b in zip(ours, wanted, strict=True):
         assert_close(a, b)
+    assert_close(torch.autograd.grad((share * found[0]).sum(), y)[0], wanted[1])
 
 
-def test_a_lagrangian_spares_the_function_except_for_second_derivatives() -> None:
+def test_an_adjoint_spares_the_function_except_where_more_is_asked() -> None:
     calls: list[str] = []
 
     def function(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         calls.append("function")
         return root(x, y)
 
-    def lagrangian(*arguments: tuple[Tensor, ...] | Tensor) -> Tensor:
-        calls.append("lagrangian")
-        return implicit(*arguments)  # type: ignore[arg-type]
+    def adjoint(*arguments: Any) -> tuple[Tensor | None, ...]:
+        calls.append("adjoint")
+        return implicit(*arguments)
 
     x, y = leaves(torch.tensor([[0.5, 1.0], [1.0, 1.5]]).double())
-    both = WithLagrangian(function, lagrangian)
-    recomputed(both, x, y, values=root)[0].sum().backward()
-    assert calls == ["lagrangian"]
-    assert torch.autograd.gradgradcheck(lambda x, y: recomputed(both, x, y)[0], (x, y))
+    both = WithAdjoint(function, adjoint)
     kept: list[Tensor] = []
     with torch.autograd.graph.saved_tensors_hooks(
         lambda tensor: kept.append(tensor) or tensor,  # type: ignore[func-returns-value]
         lambda tensor: tensor,
     ):
-        recomputed(both, x, y)
-    assert len(kept) == 4  # the inputs, and the outputs but the first
+        found = recomputed(both, x, y, values=root)[0]
+    assert len(kept) == 2  # the inputs
+    found.sum().backward(retain_graph=True)
+    assert calls == ["adjoint"]
+    # A batch of gradients at once, whose sums an adjoint could not tell apart.
+    rows = torch.autograd.grad(found, x, torch.eye(2).double(), is_grads_batched=True)[0]
+    assert calls[1:] == ["function"]
+    assert x.grad is not None
+    assert_close(rows, torch.diag(x.grad))
+    assert torch.autograd.gradgradcheck(lambda x, y: recomputed(both, x, y)[0], (x, y))
