@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.checks import batch_shape, check_floating, check_shapes
 from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
 from deltas_geom.numerics.chunks import cut_points
@@ -181,7 +180,7 @@ def _see(cameras: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | N
     inverse = torch.where(known, square, 1.0).rsqrt()
     finite = ((known & size.isfinite()) | ~used).all(dim=-2) & largest.isfinite().squeeze(-2)
     used = used & finite.unsqueeze(-2)
-    centers = camera_centers(pose)
+    centers = -(pose[..., :3, :3].mT @ pose[..., :3, 3:]).squeeze(-1)  # whatever the last row
     seen = used.any(dim=-1)[..., None]
     around = torch.where(seen, centers.detach(), 0.0).sum(dim=-2, keepdim=True)
     around = around / seen.sum(dim=-2, keepdim=True).clamp(min=1)

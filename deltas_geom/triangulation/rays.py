@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.checks import check_floating, check_shapes
 from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
 from deltas_geom.numerics.chunks import cut_points
@@ -158,7 +157,7 @@ def _see(
     # A pose that is not finite turns it into nothing.
     squared = direction.square().sum(dim=-2, keepdim=True)
     return _Seen(
-        centers=camera_centers(pose),
+        centers=-(pose[..., :3, :3].mT @ pose[..., :3, 3:]).squeeze(-1),  # whatever the last row
         broken=(~finite).to(work),
         directions=direction * torch.where(squared > 0, squared, 1.0).rsqrt(),
         weights=weigh(weights, mask, batch=batch, like=rays, sound=sound),
