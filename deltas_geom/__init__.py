@@ -17,6 +17,7 @@ from deltas_geom.cameras.poses import camera_centers, invert_pose, is_rigid, rel
 from deltas_geom.cameras.projection import Projection, pixel_rays, project, unproject
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import ShapeError
+from deltas_geom.diagnosis.diagnose import diagnose
 from deltas_geom.epipolar.fundamental import epipolar_distance, epipolar_lines, fundamental_between
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths, sample_map, sample_segments
 from deltas_geom.epipolar.segments import Segments, epipolar_segments
@@ -36,6 +37,7 @@ from deltas_geom.triangulation.midpoint import (
     triangulate_inverse_depth_weighted,
     triangulate_midpoint,
 )
+from deltas_geom.triangulation.prepared import PreparedTriangulator
 from deltas_geom.triangulation.rays import triangulate_rays
 from deltas_geom.triangulation.refine import Refined, refine_points
 from deltas_geom.triangulation.results import RobustTriangulation, Triangulation
@@ -55,6 +57,7 @@ __all__ = [
     "EpipolarSampler",
     "Matches",
     "PosedViews",
+    "PreparedTriangulator",
     "Projection",
     "Refined",
     "RobustTriangulation",
@@ -73,6 +76,7 @@ __all__ = [
     "correlate_normalized",
     "crop_intrinsics",
     "depth_variance",
+    "diagnose",
     "epipolar_distance",
     "epipolar_lines",
     "epipolar_segments",

@@ -75,19 +75,9 @@ def normal_coefficients(proj: Tensor) -> Tensor:
     Args:
         proj: ``(*B, V, 3, K)`` rows p1, p2, p3, of K = 4 (homogeneous points) or 3 entries.
     """
-    p1, p2, p3 = proj.unbind(dim=-2)
-    first, second = _outer(p3, p1), _outer(p3, p2)
-    squares = torch.stack(
-        [
-            _outer(p3, p3),
-            -(first + first.mT),
-            -(second + second.mT),
-            _outer(p1, p1) + _outer(p2, p2),
-        ],
-        dim=-3,
-    )  # (*B, V, 4, K, K)
+    outer = proj[..., :, None, :, None] * proj[..., None, :, None, :]  # (*B, V, 3, 3, K, K)
+    (e11, _, e13), (_, e22, e23), (e31, e32, e33) = (
+        row.unbind(dim=-3) for row in outer.unbind(dim=-4)
+    )
+    squares = torch.stack([e33, -(e31 + e13), -(e32 + e23), e11 + e22], dim=-3)
     return torch.cat([squares[..., row, row:] for row in range(proj.shape[-1])], dim=-1)
-
-
-def _outer(a: Tensor, b: Tensor) -> Tensor:
-    return a.unsqueeze(-1) * b.unsqueeze(-2)

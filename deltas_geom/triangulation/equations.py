@@ -25,6 +25,7 @@ from deltas_geom.triangulation.rig_frame import (
     rig_frame,
     rig_sums,
 )
+from deltas_geom.triangulation.short import ShortRig
 from deltas_geom.triangulation.weights import weigh
 
 Frame = Literal["rig", "world"]
@@ -83,7 +84,16 @@ class Equations(NamedTuple):
 
 def rig_of(proj: Tensor) -> Rig:
     """All that is needed of cameras ``(*B, V, 3, 4)``."""
-    cameras = cameras_of(proj)
+    return _rig(cameras_of(proj))
+
+
+def rig_like(known: ShortRig) -> Rig:
+    """The same from what the short way needs, which is found faster."""
+    proj, finite, centers = map(torch.from_numpy, (known.proj, known.finite, known.centers))
+    return _rig(Cameras(proj, (~finite).double(), centers))
+
+
+def _rig(cameras: Cameras) -> Rig:
     rows, datum = cameras.proj[..., :3], datum_of(cameras.centers)
     # Of M (x - centre): nothing cancels, wherever the world's origin is.
     moved = cameras.proj[..., 3:] + (rows * datum.unsqueeze(-2)).sum(dim=-1, keepdim=True)

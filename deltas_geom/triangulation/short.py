@@ -14,7 +14,7 @@ from deltas_geom.status import Status
 from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 Array = NDArray[Any]
-FEW = 128
+FEW = 256
 """Points up to which this is the shorter way."""
 _POLISH = 2
 _EPS = float(np.finfo(np.float64).eps)

@@ -8,7 +8,7 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, transformed
-from deltas_geom.triangulation.equations import Frame, Rig, rig_of
+from deltas_geom.triangulation.equations import Frame, Rig, rig_like, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
 from deltas_geom.triangulation.observed import check_observed
@@ -107,7 +107,9 @@ class KnownCameras:
     def long(self) -> Rig:
         """For any number of points; without gradient."""
         if self._long is None:
-            self._long = rig_of(self.proj.detach())
+            proj = self.proj.detach()
+            plain = values_at_hand(proj) and proj.dtype in _PLAIN
+            self._long = rig_like(self.short()) if plain else rig_of(proj)
         return self._long
 
 

@@ -1,0 +1,86 @@
+"""Triangulation by cameras that stay, frame after frame."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from deltas_geom.numerics.arithmetic import at_least_single, without_autocast
+from deltas_geom.triangulation.equations import Frame
+from deltas_geom.triangulation.results import Triangulation
+from deltas_geom.triangulation.triangulate import Call, KnownCameras
+
+
+class PreparedTriangulator:
+    """Keeps what depends on the cameras alone; :meth:`Triangulator.prepare` makes it.
+
+    Answers and gradients, also those by the cameras, are those of :func:`triangulate`. Cameras that
+    are changed in place are noticed, and looked at anew.
+
+    Args:
+        proj: ``(*B, V, 3, 4)`` K [R | t].
+        frame: as for :func:`triangulate`.
+        covariance: as for :func:`triangulate`.
+        max_residual: as for :func:`triangulate`.
+
+    Example:
+        >>> left = torch.tensor([[100.0, 0, 50, 0], [0, 100, 40, 0], [0, 0, 1, 0]])
+        >>> right = left.clone()
+        >>> right[0, 3] = -20.0  # 20 cm to the right
+        >>> rig = PreparedTriangulator(torch.stack([left, right]))
+        >>> rig.points(torch.tensor([[[60.0, 40.0]], [[50.0, 40.0]]])).round(decimals=3)
+        tensor([[0.2000, 0.0000, 2.0000]])
+    """
+
+    def __init__(
+        self,
+        proj: Tensor,
+        *,
+        frame: Frame = "rig",
+        covariance: bool = False,
+        max_residual: float | None = None,
+    ) -> None:
+        self.proj = at_least_single(proj)
+        self.frame: Frame = frame
+        self.covariance = covariance
+        self.max_residual = max_residual
+        self._renew()
+
+    def _renew(self) -> None:
+        self._cameras, self._version = KnownCameras(self.proj), _version_of(self.proj)
+
+    def _known(self) -> KnownCameras:
+        version = _version_of(self.proj)
+        if version is None or version != self._version:
+            self._renew()
+        return self._cameras
+
+    @without_autocast
+    def points(
+        self, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """Points ``(*B, N, 3)`` alone, as :func:`triangulate_points`."""
+        return Call(self._known(), pixels, weights, mask, self.frame).points()
+
+    @without_autocast
+    def full(
+        self, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
+    ) -> Triangulation:
+        """Points with status and all that is known about them, as :func:`triangulate`."""
+        call = Call(self._known(), pixels, weights, mask, self.frame)
+        found = call.full(covariance=self.covariance)
+        return found if self.max_residual is None else found.within_residual(self.max_residual)
+
+    def to(self, *args: Any, **kwargs: Any) -> "PreparedTriangulator":
+        """The same for cameras moved as by :meth:`torch.Tensor.to`."""
+        return PreparedTriangulator(
+            self.proj.to(*args, **kwargs),
+            frame=self.frame,
+            covariance=self.covariance,
+            max_residual=self.max_residual,
+        )
+
+
+def _version_of(tensor: Tensor) -> int | None:
+    """How often it was changed in place; None where torch does not count."""
+    return None if tensor.is_inference() or torch.compiler.is_compiling() else tensor._version
