@@ -70,7 +70,7 @@ class Frame:
         return self.memory.get(self.image_path, self._decode_image)
 
     def check_image(self) -> None:
-        """Find what :meth:`read_image` would raise; decode only where nothing less can tell.
+        """Raise what :meth:`read_image` would; decode only where the file's header cannot tell.
 
         Raises:
             UserError: as :meth:`read_image`.
@@ -98,7 +98,7 @@ class Frame:
         return np.where(unknown, 0.0, millimetres / 1000.0).astype(np.float32)
 
     def check_depth(self) -> None:
-        """Find what :meth:`read_depth` would raise, as :meth:`check_image` does.
+        """Raise what :meth:`read_depth` would, as :meth:`check_image` does.
 
         Raises:
             UserError: as :meth:`read_depth`.

@@ -82,7 +82,7 @@ def check_frames(
 ) -> None:
     """Check every frame that a set names, before anything is computed or written.
 
-    A file is decoded only where nothing less tells that it is whole.
+    A file is decoded only where its header and its end do not tell that it is whole.
 
     Args:
         capture: the frames.

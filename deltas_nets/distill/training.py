@@ -221,7 +221,7 @@ def record_of(config: DistillConfig, before: dict[str, str], loss: Tensor) -> di
 
 
 def _with_last(listed: str, new: str) -> str:
-    """A list with one more at its end, and that only there."""
+    """A list with an item at its end, and nowhere before."""
     kept = [part for part in listed.split("; ") if part and part != new]
     return "; ".join([*kept, new])
 

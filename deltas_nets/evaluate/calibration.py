@@ -78,7 +78,7 @@ class Sparsification(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """0.5: the certain half has half of the error. 1: the order says nothing."""
+        """0.5 where the certain half has half of the error; 1 where the order says nothing."""
         return self.half / self.every if self.every > 0 else float("nan")
 
     @property

@@ -229,7 +229,7 @@ def program_runner(content: bytes, device: torch.device) -> ProgramRunner:
 
 
 def _last_cause(error: BaseException) -> str:
-    """What it came from, in a line."""
+    """The error that an exception came from, in a line."""
     while error.__cause__ is not None:
         error = error.__cause__
     return " ".join(str(error).split())[:200]

@@ -69,7 +69,7 @@ def keypoint_targets(
 def read_nearest(maps: Tensor, pixels: Tensor) -> Tensor:
     """Values ``(*B, N)`` of maps ``(*B, H, W)`` at the pixels ``(*B, N, 2)`` they contain.
 
-    Depth is read without interpolation: a mean over an edge is the depth of nothing. Pixels
+    Depth is read without interpolation: the mean over an edge is the depth of no surface. Pixels
     outside read the border.
     """
     height, width = maps.shape[-2:]

@@ -36,7 +36,7 @@ class WideLinear(nn.Linear):
 
 
 class WideRowConv(nn.Conv1d):
-    """A convolution with a bias along the rows of maps, likewise."""
+    """A convolution with a bias along the rows of maps, as :class:`WideLinear`."""
 
     def forward(self, input: Tensor) -> Tensor:
         """``(B, inputs, N, S)`` to ``(B, outputs, N, S)``: all N rows of S by the same kernel."""
@@ -47,7 +47,7 @@ class WideRowConv(nn.Conv1d):
 
 
 class WideBatchNorm1d(nn.BatchNorm1d):
-    """Batch norm, likewise; its statistics are kept in their own dtype."""
+    """Batch norm, as :class:`WideLinear`; its statistics are kept in their own dtype."""
 
     def forward(self, input: Tensor) -> Tensor:
         """``(B, C)`` of the same shape."""
@@ -79,7 +79,7 @@ def upsample_to(coarse: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def zero_initialised(layer: nn.Conv1d | nn.Conv2d) -> nn.Conv1d | nn.Conv2d:
-    """A correction that starts as none."""
+    """A correction that is 0 at the start."""
     nn.init.zeros_(layer.weight)
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)

@@ -28,8 +28,8 @@ class Moved(NamedTuple):
 def moved_to_anchor(views: PosedViews, dtype: torch.dtype) -> Moved:
     """The cameras in a world whose origin is the centre of view 0.
 
-    Where exactly that is matters little: what is true of rotations that are none to the last digit
-    stays true.
+    Views keep their relative poses, also where rotations are orthogonal only to some digits: then
+    the origin is a little beside the camera.
 
     Args:
         views: ``(*B, V)`` in any world.

@@ -1,4 +1,4 @@
-"""float32 as it is, whatever the caller or the device would rather use."""
+"""The reference network computes in float32, whatever precision caller or device prefer."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

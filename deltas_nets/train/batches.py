@@ -65,7 +65,7 @@ class Batch(NamedTuple):
 
 
 class BatchMaker:
-    """Rooms as rendered, or tuples as read, to :class:`Batch`, on the device they are on.
+    """Turns rooms as rendered, or view sets as read, into a :class:`Batch` on their device.
 
     Args:
         config: of the run.

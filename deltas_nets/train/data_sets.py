@@ -38,7 +38,7 @@ def training_data(
 def validation_data(
     config: TrainConfig, *, report: Callable[[str], None] = lambda _: None
 ) -> Subset[PosedImages] | None:
-    """Tuples of the validation split, spread evenly over it; None if the config names none.
+    """View sets of the validation split, spread evenly over it; None if the config names none.
 
     Raises:
         UserError: there is none.

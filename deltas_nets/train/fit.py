@@ -139,7 +139,7 @@ def _log(
 
 
 def metrics_of(model: nn.Module, held_out: Subset[PosedImages] | None) -> dict[str, float]:
-    """Depth metrics on held-out tuples, on rooms if there are none."""
+    """Depth metrics on held-out view sets, on rooms if there are none."""
     if held_out is None:
         return validate(model)
     return evaluate_rooms(model, held_out, depth_range=DEPTH_RANGE)

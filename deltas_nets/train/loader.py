@@ -138,7 +138,7 @@ def room_loader(
 
 
 class _OrError(Dataset[PosedImages | UserError]):
-    """Errors as items: of one that a worker raises nothing but its traceback comes through."""
+    """Hands an error over as an item: raised in a worker, it would lose all but its traceback."""
 
     def __init__(self, data: Rooms | ScanNetViewSets) -> None:
         self.data = data

@@ -18,7 +18,7 @@ CURVES = "tensorboard"
 
 
 class RunLog:
-    """Says nothing: for all processes but the first."""
+    """A log that writes nothing, for all processes but the first."""
 
     def __enter__(self) -> "RunLog":
         return self

@@ -181,7 +181,7 @@ class Stepper:
 
 
 def unreached(model: Deltas, config: TrainConfig) -> list[str]:
-    """Parameters that no loss depends on: DDP waits for their gradients in vain.
+    """Parameters that no loss depends on, for whose gradients DDP would wait in vain.
 
     They follow from the config alone, not from the number of views or what they show.
     """

@@ -115,7 +115,7 @@ class _Round(nn.Module):
 
 
 def smooth_scores(inputs: int) -> nn.Sequential:
-    """A correction of scores by their neighbours along the samples; it starts as none."""
+    """A correction of scores by their neighbours along the samples; it is 0 at the start."""
     return nn.Sequential(
         WideRowConv(inputs, 12, 5, padding=2),
         nn.ReLU(),

@@ -45,7 +45,7 @@ def samples_per_bin(
 ) -> Tensor:
     """How many samples a bin needs, ``(B,)`` whole numbers from 1 to ``most``.
 
-    Each view set of a batch has its own number: what it is batched with changes nothing of it.
+    Each view set of a batch has its own number, which does not depend on the others.
 
     Args:
         views: the anchor (view 0) and its sources, ``(B, V)``.

@@ -95,7 +95,7 @@ def of_triangulation(
 
 @torch.no_grad()
 def of_refinement(chosen: Chosen, matches: Matches) -> Tensor:
-    """How far views moved their matches, do they trust them, how many? ``(B, N, 3)``, bounded."""
+    """How far views moved their matches, how much they trust them, how many: ``(B, N, 3)``."""
     used = matches.mask[:, 1:]
     count = used.sum(dim=1)
     moved = _mean(chosen.moved, used, count).clamp_max(10.0)  # px
