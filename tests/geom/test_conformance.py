@@ -462,8 +462,9 @@ def test_the_page_runs_and_lists_what_fails(capsys: pytest.CaptureFixture[str]) 
 
 def test_the_page_on_geometry_runs_and_names_what_there_is() -> None:
     page = (DOCS.parent / "geometry.md").read_text()
-    first, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-    exec(compile(first, "docs/geometry.md", "exec"), {"__name__": "page"})
+    names = {"__name__": "page"}
+    for snippet in re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE):
+        exec(compile(snippet, "docs/geometry.md", "exec"), names)
     solvers = {name for name in deltas_geom.__all__ if name.startswith("triangulate")}
     assert set(re.findall(r"triangulate(?:_\w+)?", page)) == solvers
 
