@@ -8,15 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.homogeneous import to_homogeneous
-from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, without_autocast
+from deltas_geom.numerics.arithmetic import surely_all, without_autocast
 from deltas_geom.numerics.sums import product
 from deltas_geom.status import Status
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.results import RobustTriangulation
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
-from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
+from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT, check_weights
 
 _BUDGET = 2**17  # distances at a time: what lies between stays in the cache
 _ROUNDS = 3  # of improving the inliers by their own point; the first settles nearly all
@@ -93,7 +92,7 @@ def triangulate_robust(
 
     with torch.no_grad():
         known = KnownCameras(proj)
-        observed = _observe(proj, pixels, weights, mask)
+        observed = _observe(known, pixels, weights, mask)
         chunk = max(1, min(8192, _BUDGET // max(1, observed.usable.shape[:-1].numel())))
         parts = [
             _consensus(known, observed.some(start, chunk), threshold, min_inliers, max_pairs)
@@ -140,37 +139,36 @@ class _Observations(NamedTuple):
 
 
 def _observe(
-    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+    known: KnownCameras, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> _Observations:
-    work = solver_dtype(proj)
+    cameras, inverse = known.inverses()
+    work = cameras.proj.dtype
     weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
     if mask is not None:
         weight = torch.where(mask, weight, 0.0)
-    batch = check_observed(proj, pixels, weights, mask)
+    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", cameras.proj.shape[:-3])
     weight = weight.to(work).abs().expand(*batch, *weight.shape[-2:])
     pixels = pixels.to(work).expand(*weight.shape, 2)
-    proj = proj.to(work).expand(*batch, *proj.shape[-3:])
-
+    healthy = (cameras.broken == 0).unsqueeze(-1)
     # What is beyond counts as not finite: products of four overflow. NaN is beyond.
     limit = torch.finfo(work).max ** 0.25
-    known_camera = (proj.abs() < limit).all(-1).all(-1)
-    known = (pixels.abs() < limit).all(dim=-1) & weight.isfinite() & known_camera[..., None]
+    sound = (pixels.abs() < limit).all(dim=-1) & weight.isfinite() & healthy
     used = weight != 0  # NaN counts as used
-    usable = used & known
+    usable = used & sound
     largest = torch.where(usable, weight, 0.0).amax(dim=-2, keepdim=True)
     usable = usable & (weight > NEGLIGIBLE_WEIGHT * largest)  # as in triangulation
-    proj = torch.where(known_camera[..., None, None], proj, 0.0)
-    inverse = torch.linalg.inv_ex(proj[..., :3]).inverse
-    rays = torch.where((inverse.abs() < limit).all(-1).all(-1)[..., None, None], inverse, 0.0)
-    pixels = torch.where(usable[..., None], pixels, 0.0)
+    if not surely_all(usable):
+        pixels = torch.where(usable[..., None], pixels, 0.0)
+        weight = torch.where(usable, weight, 0.0)
+    rays = inverse[..., :2] @ pixels.mT + inverse[..., 2:]  # (*B, V, 3, N)
     return _Observations(
-        proj=proj,
+        proj=cameras.proj.expand(*batch, *cameras.proj.shape[-3:]),
         pixels=pixels,
-        weights=torch.where(usable, weight / torch.where(largest > 0, largest, 1.0), 0.0),
+        weights=weight / torch.where(largest > 0, largest, 1.0),
         usable=usable,
-        finite=(known | ~used).all(dim=-2),
-        centers=-(rays @ proj[..., 3:]).squeeze(-1),
-        directions=(rays @ to_homogeneous(pixels).mT).transpose(-3, -2),
+        finite=(sound | ~used).all(dim=-2),
+        centers=cameras.centers.expand(*batch, *cameras.centers.shape[-2:]),
+        directions=rays.transpose(-3, -2).expand(*batch, -1, -1, -1),
     )
 
 
@@ -210,6 +208,7 @@ def _consensus(
         return _judge(observed, points, exist, threshold, min_inliers)
 
     points, status = solved(observed.usable)
+    used, again = observed.usable, status
     best = judged(points, ok(status).unsqueeze(-2))
     pairs = _pairs(observed.usable, max_pairs)
     at_once = max(1, _BUDGET // max(1, observed.usable.numel()))
@@ -219,9 +218,10 @@ def _consensus(
     agree = best.inliers
     for _ in range(_ROUNDS):
         # The better point finds inliers that a pair's noise had hidden, or loses some.
-        points, again = solved(best.inliers)
+        same = surely_all(best.inliers == used)
+        points, again = (points, again) if same else solved(best.inliers)
         agree = _distances(observed, points)[0].squeeze(-2) < threshold**2
-        before = best
+        before, used = best, best.inliers
         best = best.or_cheaper(judged(points, ok(again).unsqueeze(-2)))
         if surely_all(best.inliers == before.inliers):
             break

@@ -11,7 +11,7 @@ from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, t
 from deltas_geom.triangulation.equations import Frame, Rig, rig_like, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
-from deltas_geom.triangulation.observed import check_observed
+from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed, inverted
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.short import FEW, ShortRig, short_rig
 from deltas_geom.triangulation.short_way import ShortWay
@@ -98,6 +98,23 @@ class KnownCameras:
         self._short: ShortRig | None = None
         self._long: Rig | None = None
 
+    def inverses(self) -> tuple[Cameras, Tensor]:
+        """The cameras in the solver's type, and inverses ``(*B, V, 3, 3)`` of their first columns.
+
+        Without gradient; 0 where there is no inverse.
+        """
+        proj = self.proj.detach()
+        if self._plain():
+            rig = self.short()
+            clean, finite, centers = map(torch.from_numpy, (rig.proj, rig.finite, rig.centers))
+            return Cameras(clean, (~finite).double(), centers), torch.from_numpy(rig.inverse)
+        cameras = cameras_of(proj)
+        cofactors, inverse = inverted(cameras.proj[..., :3])
+        return cameras, cofactors.mT * inverse[..., None, None]
+
+    def _plain(self) -> bool:
+        return values_at_hand(self.proj) and self.proj.dtype in _PLAIN
+
     def short(self) -> ShortRig:
         """For few points."""
         if self._short is None:
@@ -107,9 +124,7 @@ class KnownCameras:
     def long(self) -> Rig:
         """For any number of points; without gradient."""
         if self._long is None:
-            proj = self.proj.detach()
-            plain = values_at_hand(proj) and proj.dtype in _PLAIN
-            self._long = rig_like(self.short()) if plain else rig_of(proj)
+            self._long = rig_like(self.short()) if self._plain() else rig_of(self.proj.detach())
         return self._long
 
 
