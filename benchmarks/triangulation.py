@@ -1,11 +1,14 @@
 """Triangulation beside its peers: one thread, answers first, ratios from one run.
 
 python benchmarks/triangulation.py [forward] [two-view] [float64] [compiled] [backward] [singly]
+    [transposed] [threads] [busy]
 
 Peers that are not installed are left out: pip install 'deltas-depth[test]' pycolmap gtsam
 """
 
+import os
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -243,6 +246,81 @@ def _gtsam(proj: Tensor, pixels: Tensor) -> Callable[[], Tensor]:
     return solve
 
 
+@torch.no_grad()
+def transposed() -> None:
+    """(N, V, 2) in memory, seen as (V, N, 2)."""
+    for num_views in (2, 5):
+        proj, pixels, weights, _ = scene(num_views)
+        other = pixels.transpose(0, 1).contiguous().transpose(0, 1)
+        straight, turned = milliseconds(
+            lambda: triangulate_points(proj, pixels, weights),  # noqa: B023
+            lambda: triangulate_points(proj, other, weights),  # noqa: B023
+        )
+        print(f"{num_views} views, transposed: {turned / straight:.2f} of the time (at most 1.1)")
+
+
+def wall_and_processor(run: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median milliseconds of a call."""
+    walls, processors = [], []
+    for repeat in range(repeats + 1):
+        wall, processor = time.perf_counter(), time.process_time()
+        run()
+        if repeat:
+            walls.append(time.perf_counter() - wall)
+            processors.append(time.process_time() - processor)
+    return 1000 * statistics.median(walls), 1000 * statistics.median(processors)
+
+
+@torch.no_grad()
+def threads() -> None:
+    """Two threads beside one: they must not cost anything."""
+    for count in (1000, 10_000, 100_000, 1_000_000):
+        proj, pixels, weights, _ = scene(3)
+        times = -(-count // NUM_POINTS)
+        pixels = pixels.repeat(1, times, 1)[:, :count].contiguous()
+        weights = weights.repeat(1, times)[:, :count].contiguous()
+        found = []
+        for number in (1, 2, 1, 2):  # in turns, so that all see the same machine
+            torch.set_num_threads(number)
+            repeats = max(3, 200_000 // count)
+            found.append(
+                wall_and_processor(lambda: triangulate_points(proj, pixels, weights), repeats)  # noqa: B023
+            )
+        torch.set_num_threads(1)
+        one, two = (tuple(map(min, zip(*found[k::2], strict=True))) for k in (0, 1))
+        shown = f"wall {two[0] / one[0]:.2f} (1), processor {two[1] / one[1]:.2f} (1.3)"
+        print(f"{count} points, two threads by one: {shown}", flush=True)
+
+
+def busy() -> None:
+    """With default threads, beside a process that keeps another core busy."""
+    torch.set_num_threads(os.cpu_count() or 1)
+    other = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        for num_views in (2, 3, 5):
+            proj, pixels, weights, _ = scene(num_views)
+            inputs = [tensor.clone().requires_grad_() for tensor in (proj, pixels, weights)]
+            shown = []
+            for ours, svd, goal in (
+                (
+                    lambda: triangulate_points(proj, pixels, weights),  # noqa: B023
+                    lambda: svd_dlt(proj, pixels, weights),  # noqa: B023
+                    "7",
+                ),
+                (
+                    lambda: _there_and_back(triangulate_points, inputs),  # noqa: B023
+                    lambda: _there_and_back(svd_dlt, inputs),  # noqa: B023
+                    "2.2",
+                ),
+            ):
+                mine, theirs = (wall_and_processor(run, 5)[0] for run in (ours, svd))
+                shown.append(f"{mine:.0f} ms, torch SVD {theirs / mine:.1f}x ({goal})")
+            print(f"{num_views} views beside a busy process, wall: " + "; back too ".join(shown))
+    finally:
+        other.kill()
+        torch.set_num_threads(1)
+
+
 PARTS = {
     "forward": forward,
     "two-view": two_view,
@@ -250,6 +328,9 @@ PARTS = {
     "compiled": compiled,
     "backward": backward,
     "singly": singly,
+    "transposed": transposed,
+    "threads": threads,
+    "busy": busy,
 }
 
 

@@ -160,7 +160,7 @@ def _observe(
     if not surely_all(usable):
         pixels = torch.where(usable[..., None], pixels, 0.0)
         weight = torch.where(usable, weight, 0.0)
-    rays = inverse[..., :2] @ pixels.mT + inverse[..., 2:]  # (*B, V, 3, N)
+    rays = product(inverse[..., :2], pixels.mT) + inverse[..., 2:]  # (*B, V, 3, N)
     return _Observations(
         proj=cameras.proj.expand(*batch, *cameras.proj.shape[-3:]),
         pixels=pixels,
