@@ -26,7 +26,7 @@ def diagnose(
     disagrees with all others: each is mended in turn, for all cameras and for the worst, and the
     residuals are compared. They are distances in px of matches from what a view sees of another
     view's ray, which ends at the epipole and at infinity, so that points behind cameras count as
-    wrong; a third of the matches of a pair of views must fit. So up to 30 % of the pixels may be
+    wrong; a quarter of the matches of a pair of views must fit. So up to 30 % of the pixels may be
     wrong. For people and commands: it looks at values, computes in float64 on the CPU, and has no
     gradients.
 
@@ -141,7 +141,7 @@ def _disagreeing(given: Trial, evidence: Evidence, threshold: float) -> Trial | 
         own, rest = given.residual[concerned], given.residual[~concerned]
         limit = max(threshold, 3 * level(rest))
         apart = level(own) > limit and float((own > limit).double().mean()) > 0.6
-        if apart and level(rest) <= max(threshold, level(own) / 6):
+        if apart and _well(rest, evidence.of(~concerned), len(given.what.K), limit):
             what = given.what._replace(cause=Cause.CAMERA_DISAGREES, cameras=(camera,))
             return Trial(what, torch.where(concerned, torch.nan, given.residual), concerned)
     return None
@@ -159,8 +159,9 @@ def _without_cause(
     off = displacements(evidence, K, pose)
     still = float((off <= min(threshold, max(4 * residual, 0.1))).double().mean()) >= 0.9
     if still or one_place:
-        return told.says(given.what._replace(cause=Cause.NO_BASELINE), moves=not still)
-    if not _well(given, evidence, threshold):
+        moves = not still and residual > threshold
+        return told.says(given.what._replace(cause=Cause.NO_BASELINE), moves=moves)
+    if not _well(given.residual, evidence, len(K), threshold):
         return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
     trials = [trial for trial in trials if not trial.what.cameras]
     for factor in (0.5, 2.0):
@@ -171,9 +172,9 @@ def _without_cause(
     return told.says(given.what)._replace(untold=tuple(untold))
 
 
-def _well(given: Trial, evidence: Evidence, threshold: float) -> bool:
+def _well(residual: Tensor, evidence: Evidence, views: int, limit: float) -> bool:
     """Four fifths of the pairs fit, and a third of each camera's: no camera is out of place."""
-    fit = given.residual <= threshold
-    each = [fit[evidence.with_camera(camera)] for camera in range(len(given.what.K))]
+    fit = residual <= limit
+    each = [fit[evidence.with_camera(camera)] for camera in range(views)]
     shares = [float(own.double().mean()) for own in each if len(own)]
     return float(fit.double().mean()) >= 0.8 and min(shares) >= 0.3

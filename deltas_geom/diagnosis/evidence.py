@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 LEAST_MATCHES = 8  # of a pair of views
-SHARE = 1 / 3  # of a pair's matches that must fit: with 30 % wrong pixels, half of them do
+SHARE = 1 / 4  # of a pair's matches must fit: with 30 % wrong pixels, half of them can
 CAP = 50.0  # px: beyond, wrong is wrong
 _PARTNERS = 5  # of each view
 _MOST = 96  # matches looked at in a pair
@@ -81,7 +81,7 @@ def choose_pairs(seen: Tensor) -> Tensor:
 
 
 def residuals(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
-    """Distance in px that a third of a pair's matches keep within, ``(P)``.
+    """Distance in px that a quarter of a pair's matches keep within, ``(P)``.
 
     A match is as far off as its pixel in one view is from what that view sees of the other
     pixel's ray: a half line, from the ray's far end to the epipole. So a point behind a camera

@@ -98,9 +98,10 @@ def explains(given: Trial, trial: Trial, threshold: float, *, on: Tensor | None 
     # All matches of some of many pairs may be wrong; of one camera's few pairs all count.
     of = level if bool(on.all()) else _mean
     before, after = of(given.residual[on]), of(trial.residual[on])
-    if before > threshold and after <= 0.5 * before:
-        return after <= threshold or after <= 0.25 * before
-    return before > _EXACT and after <= 0.1 * before
+    if before > threshold and after <= min(0.5 * before, threshold):
+        return True
+    enough = after <= min(0.25 * before, 2 * threshold) and before - after > 0.5 * threshold
+    return enough or (before > _EXACT and after <= 0.1 * before)
 
 
 def _mean(residual: Tensor) -> float:
