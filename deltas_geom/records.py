@@ -91,9 +91,13 @@ def tensors_of(values: Any) -> list[Tensor]:
     """All tensors in a nest of tuples, in order."""
     if isinstance(values, Tensor):
         return [values]
-    if not isinstance(values, tuple):
-        return []
-    return [tensor for value in values for tensor in tensors_of(value)]
+    found: list[Tensor] = []
+    for value in values if isinstance(values, tuple) else ():
+        if isinstance(value, Tensor):
+            found.append(value)
+        elif isinstance(value, tuple):
+            found += tensors_of(value)
+    return found
 
 
 def _described(value: Any, name: str = "") -> str:

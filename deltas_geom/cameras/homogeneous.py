@@ -1,10 +1,10 @@
 """To and from homogeneous coordinates, without a division by zero."""
 
-import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom.checks import check_shapes
-from deltas_geom.numerics.arithmetic import finite_or_zero, without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, only, unless_all, without_autocast
 
 
 @without_autocast
@@ -12,23 +12,30 @@ def to_homogeneous(coordinates: Tensor) -> Tensor:
     """Append a one: ``(*B, D)`` to ``(*B, D + 1)``; what is NaN stays so.
 
     Example:
+        >>> import torch
         >>> to_homogeneous(torch.tensor([2.0, 3.0]))
         tensor([2., 3., 1.])
     """
     check_shapes(coordinates=(coordinates, "D"))
-    return torch.cat([coordinates, torch.ones_like(coordinates[..., :1])], dim=-1)
+    return with_one(coordinates)
+
+
+def with_one(coordinates: Tensor) -> Tensor:
+    """:func:`to_homogeneous` without a look at the argument."""
+    return F.pad(coordinates, (0, 1), value=1.0)
 
 
 def safe_divide(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
     """``numerator / denominator`` where ``where`` holds, elsewhere 0 with zero gradient.
 
     Args:
-        numerator: any shape that broadcasts with the others.
+        numerator: any shape that broadcasts with the denominator.
         denominator: not zero where ``where`` holds.
-        where: bool.
+        where: bool, of a shape that broadcasts to that of the quotient.
     """
+    known = unless_all(where)
     # Double where: the unused branch must not turn the gradient into NaN.
-    return torch.where(where, numerator / torch.where(where, denominator, 1.0), 0.0)
+    return only(numerator / only(denominator, known, other=1.0), known)
 
 
 def safe_sqrt(squared: Tensor) -> Tensor:
@@ -36,9 +43,10 @@ def safe_sqrt(squared: Tensor) -> Tensor:
 
     At 0, as of a perfect match, the slope is infinite.
     """
-    positive = squared > 0
+    positive = unless_all(squared > 0)
     # Double where, as above.
-    return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
+    # Not sqrt, for which torch starts threads from 2048 numbers on.
+    return only(only(squared, positive, other=1.0).pow(0.5), positive)
 
 
 @without_autocast
@@ -49,6 +57,7 @@ def from_homogeneous(coordinates: Tensor) -> Tensor:
     test them, as ``coordinates[..., -1] != 0``, to tell them apart.
 
     Example:
+        >>> import torch
         >>> from_homogeneous(torch.tensor([[4.0, 6.0, 2.0], [1.0, 1.0, 0.0]]))
         tensor([[2., 3.],
                 [0., 0.]])

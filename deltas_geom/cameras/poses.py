@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 
 
 @without_autocast
@@ -23,14 +23,15 @@ def invert_pose(b_from_a: Tensor) -> Tensor:
     """
     check_shapes(b_from_a=(b_from_a, "4 4"))
     known, finite = finite_or_zero(b_from_a, dims=2)
-    return torch.where(finite[..., None, None], inverse_of_finite(known), torch.nan)
+    return only(inverse_of_finite(known), finite, other=torch.nan)
 
 
 def inverse_of_finite(b_from_a: Tensor) -> Tensor:
     """:func:`invert_pose` of what is finite."""
-    rotation = b_from_a[..., :3, :3].mT
-    translation = -rotation @ b_from_a[..., :3, 3:]
-    return torch.cat([torch.cat([rotation, translation], dim=-1), b_from_a[..., 3:, :]], dim=-2)
+    rows, last = b_from_a.split_with_sizes([3, 1], dim=-2)
+    rotation, translation = rows.split_with_sizes([3, 1], dim=-1)
+    center = -rotation.mT @ translation
+    return torch.cat([torch.cat([rotation.mT, center], dim=-1), last], dim=-2)
 
 
 @without_autocast
@@ -39,9 +40,8 @@ def relative_pose(b_from_world: Tensor, a_from_world: Tensor) -> Tensor:
     check_shapes(b_from_world=(b_from_world, "4 4"), a_from_world=(a_from_world, "4 4"))
     batch_shape(b_from_world.shape[:-2], a_from_world.shape[:-2])
     b_from_world, a_from_world = promoted(b_from_world, a_from_world)
-    (b, b_finite), (a, a_finite) = (finite_or_zero(x, 2) for x in (b_from_world, a_from_world))
-    finite = (a_finite & b_finite)[..., None, None]
-    return torch.where(finite, b @ inverse_of_finite(a), torch.nan)
+    (b, b_finite), (a, a_finite) = finite_or_zero(b_from_world, 2), finite_or_zero(a_from_world, 2)
+    return only(b @ inverse_of_finite(a), a_finite, b_finite, other=torch.nan)
 
 
 @without_autocast
@@ -49,8 +49,9 @@ def camera_centers(cam_from_world: Tensor) -> Tensor:
     """World positions ``(*B, 3)`` of cameras ``(*B, 4, 4)``, metres."""
     check_shapes(cam_from_world=(cam_from_world, "4 4"))
     known, finite = finite_or_zero(cam_from_world, dims=2)
-    centers = -(known[..., :3, :3].mT @ known[..., :3, 3:]).squeeze(-1)
-    return torch.where(finite[..., None], centers, torch.nan)
+    rotation, translation = known[..., :3, :].split_with_sizes([3, 1], dim=-1)
+    centers = -(rotation.mT @ translation)
+    return only(centers, finite, other=torch.nan).squeeze(-1)
 
 
 def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:

@@ -3,11 +3,10 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
-from deltas_geom.cameras.poses import inverse_of_finite
+from deltas_geom.cameras.homogeneous import safe_divide, with_one
 from deltas_geom.cameras.views import PosedViews, finite_intrinsics, finite_views
 from deltas_geom.checks import batch_shape, check_shapes
-from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 from deltas_geom.records import Record
 
 
@@ -47,17 +46,17 @@ def project(views: PosedViews, points: Tensor) -> Projection:
         tensor([[[50., 45.]]])
     """
     check_shapes(points=(points, "N 3"))
-    views, posed, batch = finite_views(views)
+    cameras, posed, batch = finite_views(views)
     batch_shape(batch, points.shape[:-2])
-    K, cam_from_world, points = promoted(*views, points)
-    known, finite = finite_or_zero(points)
-    homogeneous = to_homogeneous(known).unsqueeze(-3) @ (K @ cam_from_world[..., :3, :]).mT
-    exists = finite.unsqueeze(-2) & posed[..., None] & homogeneous.isfinite().all(dim=-1)
-    depth = torch.where(exists, homogeneous[..., 2], 0.0)
+    K, cam_from_world, points = promoted(*cameras, points)
+    known, finite = finite_or_zero(points.unsqueeze(-3))
+    homogeneous = with_one(known) @ (K @ cam_from_world[..., :3, :]).mT
+    homogeneous, _ = finite_or_zero(only(homogeneous, finite, posed))
+    depth = homogeneous[..., 2]
     # Pixels and 1 / depth enter the gradient squared, times the size of the point.
     small = torch.finfo(depth.dtype).tiny ** (1 / 3)
-    size = torch.maximum(homogeneous.abs().amax(dim=-1), known.abs().amax(dim=-1).unsqueeze(-2))
-    in_front = exists & (depth > small) & (depth > small * size.detach())
+    size = torch.maximum(homogeneous.detach().abs().amax(dim=-1), known.detach().abs().amax(dim=-1))
+    in_front = (depth > small) & (depth > small * size)
     pixels = safe_divide(homogeneous[..., :2], depth[..., None], in_front[..., None])
     return Projection(pixels, depth, in_front)
 
@@ -79,14 +78,14 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
-    views, posed, batch = finite_views(views)
-    check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"), depth=(depth, "V N"))
+    cameras, posed, batch = finite_views(views)
+    check_shapes(K=(cameras[0], "V 3 3"), pixels=(pixels, "V N 2"), depth=(depth, "V N"))
     batch_shape(batch, pixels.shape[:-3], depth.shape[:-2])
-    K, cam_from_world, pixels, depth = promoted(*views, pixels, depth)
-    (pixels, seen), (depth, measured) = finite_or_zero(pixels), finite_or_zero(depth, 0)
-    points = rays_of_finite(K, pixels) * depth[..., None]
-    points = to_homogeneous(points) @ inverse_of_finite(cam_from_world)[..., :3, :].mT
-    return torch.where((seen & measured & posed[..., None])[..., None], points, 0.0)
+    K, cam_from_world, pixels, depth = promoted(*cameras, pixels, depth)
+    (pixels, seen), (depth, measured) = finite_or_zero(pixels), finite_or_zero(depth[..., None])
+    rotation, translation = cam_from_world[..., :3, :].split_with_sizes([3, 1], dim=-1)
+    points = (rays_of_finite(K, pixels) * depth - translation.mT) @ rotation
+    return only(points, seen, measured, posed)
 
 
 @without_autocast
@@ -108,12 +107,15 @@ def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
     batch_shape(K.shape[:-2], pixels.shape[:-2])
     K, pixels = promoted(K, pixels)
     (K, known), (pixels, seen) = finite_intrinsics(K), finite_or_zero(pixels)
-    return torch.where((seen & known[..., None])[..., None], rays_of_finite(K, pixels), 0.0)
+    return only(rays_of_finite(K, pixels), seen, known)
 
 
 def rays_of_finite(K: Tensor, pixels: Tensor) -> Tensor:
     """:func:`pixel_rays` of what is finite, with focal lengths that are not 0."""
     # Back substitution: exact for a camera and cheaper than a general inverse.
-    y = (pixels[..., 1] - K[..., 1, 2, None]) / K[..., 1, 1, None]
-    x = (pixels[..., 0] - K[..., 0, 2, None] - K[..., 0, 1, None] * y) / K[..., 0, 0, None]
-    return to_homogeneous(torch.stack([x, y], dim=-1))
+    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
+    (fx, skew, cx), (_, fy, cy) = of_x.unbind(dim=-2), of_y.unbind(dim=-2)
+    x, y = pixels.unbind(dim=-1)
+    y = (y - cy) / fy
+    x = (x - cx - skew * y) / fx
+    return with_one(torch.stack([x, y], dim=-1))

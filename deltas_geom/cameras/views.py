@@ -10,7 +10,14 @@ from torch import Tensor
 from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
 from deltas_geom.cameras.poses import invert_pose, is_rigid
 from deltas_geom.checks import ShapeError, batch_shape, check_shapes, check_tensor
-from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    both,
+    finite_or_zero,
+    only,
+    promoted,
+    surely_below,
+    without_autocast,
+)
 from deltas_geom.records import Record
 
 
@@ -53,8 +60,8 @@ class PosedViews(Record):
         """
         self.check_shapes()
         K, cam_from_world = promoted(*self)
-        (K, known), (poses, posed) = (finite_or_zero(x, dims=2) for x in (K, cam_from_world))
-        return torch.where((known & posed)[..., None, None], K @ poses[..., :3, :], torch.nan)
+        (K, known), (poses, posed) = finite_or_zero(K, 2), finite_or_zero(cam_from_world, 2)
+        return only(K @ poses[..., :3, :], known, posed, other=torch.nan)
 
     @property
     def num_views(self) -> int:
@@ -198,11 +205,13 @@ class PosedViews(Record):
             raise ValueError("cam_from_world must hold finite rigid transforms (R orthogonal)")
 
 
-def finite_views(views: PosedViews) -> tuple[PosedViews, Tensor, torch.Size]:
+def finite_views(
+    views: PosedViews,
+) -> tuple[tuple[Tensor, Tensor], Tensor | None, torch.Size]:
     """Cameras to compute with: an identity, without gradient, in place of what is not finite.
 
     Returns:
-        Those cameras, which were finite ``(*B, V)`` bool, and ``*B``.
+        K and poses, which were finite ``(*B, V, 1, 1)`` bool or None if all, and ``*B``.
 
     Raises:
         ShapeError: as :meth:`PosedViews.check_shapes`.
@@ -213,15 +222,19 @@ def finite_views(views: PosedViews) -> tuple[PosedViews, Tensor, torch.Size]:
         raise TypeError(f"views must be PosedViews, got {kind}: use PosedViews(K, cam_from_world)")
     batch = views.check_shapes()
     (K, known), (poses, posed) = finite_intrinsics(views.K), finite_or_zero(views[1], dims=2)
-    return PosedViews(K, poses), known & posed, batch
+    return (K, poses), both(known, posed), batch
 
 
-def finite_intrinsics(K: Tensor) -> tuple[Tensor, Tensor]:
+def finite_intrinsics(K: Tensor) -> tuple[Tensor, Tensor | None]:
     """Intrinsics to divide by, an identity in place of what is no camera, and which are one."""
-    focal = K[..., 0, 0] * K[..., 1, 1]
-    known = (K.detach().abs().amax(dim=(-2, -1)) < torch.inf) & (focal.detach() != 0)
-    identity = torch.eye(3, device=K.device, dtype=K.dtype)
-    return torch.where(known[..., None, None], K, identity), known
+    plain = K.detach()
+    focal = plain.diagonal(dim1=-2, dim2=-1)[..., :2].prod(dim=-1)
+    if surely_below(plain) and bool(focal.all()):
+        return K, None
+    known = (plain.abs().amax(dim=(-2, -1), keepdim=True) < torch.inf) & (focal != 0)[
+        ..., None, None
+    ]
+    return torch.where(known, K, torch.eye(3, device=K.device, dtype=K.dtype)), known
 
 
 def _check_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:

@@ -3,14 +3,16 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.cameras.homogeneous import with_one
 from deltas_geom.cameras.poses import inverse_of_finite
 from deltas_geom.cameras.views import PosedViews, finite_views
 from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
+    only,
     promoted,
+    unless_all,
     without_autocast,
 )
 
@@ -56,15 +58,16 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
 
     Source: Hartley and Zisserman, 2nd ed., equation 9.2; the paper, section 3.2.
     """
-    views, finite, _ = finite_views(views)
-    K, cam_from_world = promoted(*views)
+    cameras, finite, _ = finite_views(views)
+    K, cam_from_world = promoted(*cameras)
     anchor_from_world, source_from_world = (cam_from_world[..., v, :, :] for v in (anchor, source))
     source_from_anchor = source_from_world @ inverse_of_finite(anchor_from_world)
     essential = cross_matrix(source_from_anchor[..., :3, 3]) @ source_from_anchor[..., :3, :3]
     K_anchor, K_source = K[..., anchor, :, :], K[..., source, :, :]
     fundamental = inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
-    both = finite[..., anchor] & finite[..., source]
-    return torch.where(both[..., None, None], fundamental, 0.0)
+    if finite is None:
+        return fundamental
+    return only(fundamental, finite[..., anchor, :, :], finite[..., source, :, :])
 
 
 @without_autocast
@@ -92,16 +95,18 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     batch_shape(fundamental.shape[:-2], pixels.shape[:-2])
     fundamental, pixels = promoted(fundamental, pixels)
     (fundamental, known), (pixels, seen) = finite_or_zero(fundamental, 2), finite_or_zero(pixels)
-    lines = to_homogeneous(pixels) @ fundamental.mT
+    homogeneous = with_one(pixels)
+    lines = homogeneous @ fundamental.mT
     size = lines[..., :2].detach().abs().amax(dim=-1, keepdim=True)
-    scale = to_homogeneous(pixels).abs() @ fundamental[..., :2, :].abs().mT
+    with torch.no_grad():
+        scale = homogeneous.abs() @ fundamental[..., :2, :].abs().mT
     noise = 16 * torch.finfo(lines.dtype).eps * scale.amax(dim=-1, keepdim=True)
-    has_line = (size > noise) & (seen & known[..., None])[..., None]
+    has_line = unless_all(only(size > noise, seen, known, other=False))
     # Divided by its size first, as the square of a short normal, to the power -3/2 in the
     # gradient, leaves the range of float32. Double where: no NaN from the unused branch.
-    lines = safe_divide(lines, size, has_line)
+    lines = only(lines / only(size, has_line, other=1.0), has_line)
     squared = lines[..., :2].square().sum(dim=-1, keepdim=True)
-    return lines * torch.where(has_line, squared, 1.0).rsqrt()
+    return lines * only(squared, has_line, other=1.0).rsqrt()
 
 
 @without_autocast
@@ -122,5 +127,5 @@ def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Ten
     check_shapes(fundamental=(fundamental, "3 3"), first=(first, "N 2"), second=(second, "N 2"))
     batch_shape(fundamental.shape[:-2], first.shape[:-2], second.shape[:-2])
     second, seen = finite_or_zero(second)
-    distance = (epipolar_lines(fundamental, first) * to_homogeneous(second)).sum(dim=-1)
-    return torch.where(seen, distance, 0.0)
+    terms = epipolar_lines(fundamental, first) * with_one(second)
+    return only(terms, seen).sum(dim=-1)

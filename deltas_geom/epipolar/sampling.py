@@ -15,7 +15,10 @@ from deltas_geom.epipolar.segments import Segments, epipolar_rays
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
+    numbers_or_zero,
+    only,
     promoted,
+    surely_below,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -68,20 +71,21 @@ def sample_segments(
         inv_depth_end=(segments.inv_depth_end, "S N"),
         foreshortening=(segments.foreshortening, "S N"),
     )
-    along = torch.stack(segments[2:4] + segments[5:], dim=-1)
-    known, sound = finite_or_zero(torch.cat([segments.start, segments.end, along], dim=-1))
-    start, end = known[..., :2], known[..., 2:4]
-    low, high, ratio = (known[..., place : place + 1] for place in (4, 5, 6))
+    *ends, low, high, _, ratio = segments
+    parts, sound = [*ends, *(each[..., None] for each in (low, high, ratio))], None
+    if not all(map(surely_below, parts)):
+        known, sound = finite_or_zero(torch.cat(parts, dim=-1))
+        parts = list(known.split_with_sizes([2, 2, 1, 1, 1], dim=-1))
+    start, end, low, high, ratio = parts
     fraction = torch.linspace(0, 1, num_samples, device=start.device, dtype=start.dtype)
     # Homogeneous interpolation: with r the foreshortening, a share s of the inverse depth
     # lies at the share s r / (1 - s + s r) of the pixels.
-    ratio = torch.where(sound[..., None], ratio, 1.0)
+    ratio = only(ratio, sound, other=1.0)
     if spacing == "inv_depth":
-        of_depth = fraction.expand(*ratio.shape[:-1], num_samples)
-        of_pixels = of_depth * ratio / (1 - of_depth + of_depth * ratio)
+        of_depth, nearer = fraction, fraction * ratio
+        of_pixels = nearer / (1 - fraction + nearer)
     elif spacing == "pixels":
-        of_pixels = fraction.expand(*ratio.shape[:-1], num_samples)
-        of_depth = of_pixels / (ratio * (1 - of_pixels) + of_pixels)
+        of_depth, of_pixels = fraction / (ratio * (1 - fraction) + fraction), fraction
     else:
         raise ValueError(f"spacing must be 'inv_depth' or 'pixels', got {spacing!r}")
     inv_depth = low + of_depth * (high - low)
@@ -97,7 +101,8 @@ def sample_segments(
         # Not torch.tensor, which copies numbers of the host to the device and waits for them.
         shifts = torch.stack([start.new_full((), offset) for offset in offsets])
         pixels = pixels + shifts[:, None, None] * across[..., None, None, :]
-    mask = (segments.visible & sound)[..., None, None].expand(pixels.shape[:-1])
+    mask = only(segments.visible[..., None], sound, other=False)
+    mask = mask[..., None].expand(pixels.shape[:-1])
     if image_size is not None:
         check_image_size(image_size)
         mask = mask & in_image(pixels, image_size=image_size)
@@ -128,13 +133,15 @@ def sample_inv_depths(
     check_shapes(pixels=(pixels, "N 2"), inv_depths=(inv_depths, "S"))
     rays = epipolar_rays(views, pixels)
     inv_depths, known = finite_or_zero(inv_depths, dims=0)
-    reach = torch.where(known, inv_depths.detach().abs(), torch.inf)  # nothing is that far ahead
+    reach = only(inv_depths.detach().abs(), known, other=torch.inf)  # nothing is that far ahead
     if inv_depths.ndim > 1:
         inv_depths, reach = inv_depths.unsqueeze(-3), reach.unsqueeze(-3)
     inv_depth = inv_depths.expand(batch_shape((*rays.origin.shape[:-1], 1), inv_depths.shape))
     homogeneous = rays.at(inv_depth)
     least = rays.clearance[..., None] + reach * rays.clearance_slope[..., None]
-    in_front = (homogeneous[..., 2] > least) & rays.usable[..., None]
+    in_front = homogeneous[..., 2] > least
+    if rays.usable is not None:
+        in_front = in_front & rays.usable[..., None]
     where = safe_divide(homogeneous[..., :2], homogeneous[..., 2:], in_front[..., None])
     mask = in_front & in_image(where, image_size=image_size)
     return Samples(where.unsqueeze(-3), inv_depth, mask.unsqueeze(-2))
@@ -171,7 +178,7 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
     # The count, not -1: a reshape of no keypoints cannot infer it.
     count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]
     maps, pixels = promoted(feature_map, pixels)
-    maps = maps.nan_to_num(0.0, 0.0, 0.0).expand(*batch, *size).reshape(count, *size)
+    maps = numbers_or_zero(maps).expand(*batch, *size).reshape(count, *size)
     grid = normalize_pixels(pixels, image_size=image_size)
     grid = grid.expand(*batch, num, 2).reshape(count, 1, num, 2)
     read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)

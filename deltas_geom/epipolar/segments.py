@@ -10,13 +10,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.homogeneous import safe_divide, to_homogeneous
+from deltas_geom.cameras.homogeneous import safe_divide, with_one
 from deltas_geom.cameras.poses import inverse_of_finite
 from deltas_geom.cameras.projection import rays_of_finite
 from deltas_geom.cameras.views import PosedViews, finite_views
 from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
 from deltas_geom.epipolar.fundamental import inverse_intrinsics
-from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import both, finite_or_zero, only, promoted, without_autocast
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 
@@ -34,8 +34,8 @@ class EpipolarRays(NamedTuple):
         origin: ``(*B, V-1, N, 3)`` homogeneous source pixel of the point at infinity.
         slope: ``(*B, V-1, 1, 3)`` K t, the homogeneous epipole, pixels times metres.
         usable: ``(*B, V-1, N)`` bool: the keypoint is finite and not so far out that it
-            overflows; if not, (0, 0) stands in for it; and both cameras are finite.
-        finite: ``(*B, V-1, N)`` bool: keypoint and cameras are.
+            overflows; if not, (0, 0) stands in for it; and both cameras are finite. None if all.
+        finite: ``(*B, V-1, N)`` bool: keypoint and cameras are. None if all.
         clearance: ``(*B, 1, N)``, and with inverse depth it grows by ``clearance_slope``: the
             homogeneous depth from which a point counts as in front. Without gradient.
         clearance_slope: ``(*B, V-1, 1)`` metres.
@@ -46,8 +46,8 @@ class EpipolarRays(NamedTuple):
 
     origin: Tensor
     slope: Tensor
-    usable: Tensor
-    finite: Tensor
+    usable: Tensor | None
+    finite: Tensor | None
     clearance: Tensor
     clearance_slope: Tensor
     terms: Tensor
@@ -97,20 +97,21 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     Raises:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
     """
-    views, posed, batch = finite_views(views)
-    check_shapes(K=(views.K, "+V 3 3"), pixels=(pixels, "N 2"))
+    cameras, posed, batch = finite_views(views)
+    check_shapes(K=(cameras[0], "+V 3 3"), pixels=(pixels, "N 2"))
     batch_shape(batch, pixels.shape[:-2])
-    K, cam_from_world, pixels = promoted(*views, pixels)
+    K, cam_from_world, pixels = promoted(*cameras, pixels)
     anchor_from_world = cam_from_world[..., :1, :, :]
     source_from_anchor = cam_from_world[..., 1:, :, :] @ inverse_of_finite(anchor_from_world)
     K_source = K[..., 1:, :, :]
-    # NaN is not below, either.
-    size = pixels.detach().abs().amax(dim=-1)
-    usable = size < torch.finfo(pixels.dtype).max ** 0.75
-    # A NaN would reach the gradient of every camera through the products below.
-    known = torch.where(usable[..., None], pixels, 0.0)
+    known, near = finite_or_zero(pixels, limit=torch.finfo(pixels.dtype).max ** 0.75)
+    usable = finite = None
+    if near is not None:
+        usable, finite = near[..., 0].unsqueeze(-2), pixels.isfinite().all(dim=-1).unsqueeze(-2)
+    if posed is not None:
+        sources = (posed[..., 1:, :, :] & posed[..., :1, :, :])[..., 0]
+        usable, finite = both(usable, sources), both(finite, sources)
     rays = rays_of_finite(K[..., 0, :, :], known).unsqueeze(-3)
-    both = (posed[..., 1:] & posed[..., :1])[..., None]
     translation = source_from_anchor[..., :3, 3:]
     origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
     slope = (K_source @ translation).mT
@@ -122,14 +123,14 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
         to_source = K_source.abs() @ poses[..., 1:, :3, :3]
         from_anchor = poses[..., :1, :3, :3].mT
         homography = to_source @ from_anchor @ inverse_intrinsics(K[..., :1, :, :]).abs()
-        terms = to_homogeneous(known.abs()).unsqueeze(-3) @ homography.mT
+        terms = with_one(known.abs()).unsqueeze(-3) @ homography.mT
         slope_terms = to_source @ from_anchor @ poses[..., :1, :3, 3:]
         slope_terms = slope_terms + K_source.abs() @ poses[..., 1:, :3, 3:]
     return EpipolarRays(
         origin,
         slope,
-        usable.unsqueeze(-2) & both,
-        (size < torch.inf).unsqueeze(-2) & both,
+        usable,
+        finite,
         clearance,
         clearance_slope,
         terms,
@@ -207,7 +208,7 @@ def epipolar_segments(
     high = torch.where(moving & (growth < 0), crossing, infinity).amin(dim=-1)
     low, high = low.clamp(min=1 / far), high.clamp(max=1 / near)
     always_out = (~moving & (constant < 0)).any(dim=-1)
-    visible = (low <= high) & ~always_out & rays.usable
+    visible = only((low <= high) & ~always_out, rays.usable, other=False)
 
     low, high = torch.where(visible, low, 0.0), torch.where(visible, high, 0.0)
     ends = rays.at(torch.stack([low, high], dim=-1))
@@ -222,7 +223,7 @@ def epipolar_segments(
     a_point = still | (length <= 16 * torch.finfo(length.dtype).eps * max(height, width))
     status = torch.where(a_point, Status.NO_PARALLAX.value, Status.OK.value)
     status = torch.where(visible, status, Status.EMPTY.value)
-    status = torch.where(rays.finite, status, Status.NOT_FINITE_INPUT.value).to(torch.int8)
+    status = only(status, rays.finite, other=Status.NOT_FINITE_INPUT.value).to(torch.int8)
     foreshortening = torch.where(
         visible, safe_divide(ends[..., 1, 2], ends[..., 0, 2], visible), 1.0
     )

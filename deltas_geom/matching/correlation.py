@@ -16,7 +16,12 @@ from deltas_geom.cameras.pixels import normalizing
 from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.epipolar.sampling import Samples
 from deltas_geom.matching.lengths import inverse_lengths, length_table
-from deltas_geom.numerics.arithmetic import at_least_in_single, at_least_single, promoted
+from deltas_geom.numerics.arithmetic import (
+    at_least_in_single,
+    at_least_single,
+    promoted,
+    surely_below,
+)
 from deltas_geom.numerics.evaluation import recomputed
 
 _CACHED_ELEMENTS = 1 << 21  # a chunk should stay in the cache between writing and reading it
@@ -69,9 +74,12 @@ def correlate(
         pixels.shape[:-4],
         mask.shape[:-3],
     )
-    maps, rows = map(_Finite.apply, (feature_map, descriptors))
+    maps, rows = feature_map, descriptors
+    finite = surely_below(maps) and surely_below(rows)
+    if not finite:
+        maps, rows = map(_Finite.apply, (maps, rows))
     return _in_pieces(
-        lambda *piece: _DotProducts.apply(*piece, image_size),  # type: ignore[no-untyped-call]
+        lambda *piece: _DotProducts.apply(*piece, image_size, finite),  # type: ignore[no-untyped-call]
         maps.expand(*batch, *maps.shape[-3:]),
         rows.unsqueeze(-3).expand(*batch, *rows.shape[-2:]),
         pixels.expand(*batch, *pixels.shape[-4:]),
@@ -195,15 +203,16 @@ class _DotProducts(torch.autograd.Function):
         pixels: Tensor,
         mask: Tensor,
         image_size: tuple[int, int],
+        finite: bool,
     ) -> Tensor:
-        flat, rows, grid = _in_full(features, descriptors, pixels, image_size)
+        flat, rows, grid = _in_full(features, descriptors, pixels, image_size, finite)
         maps = (rows @ flat).reshape(-1, 1, *features.shape[-2:])
         read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
         return _masked(read.reshape(mask.shape), mask)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        *tensors, ctx.image_size = inputs
+        *tensors, ctx.image_size, ctx.finite = inputs
         ctx.save_for_backward(*tensors)
 
     @staticmethod
@@ -211,7 +220,8 @@ class _DotProducts(torch.autograd.Function):
         features, descriptors, pixels, mask = ctx.saved_tensors
         moves = ctx.needs_input_grad[2]
         with torch.autocast(features.device.type, enabled=False):
-            flat, rows, grid = _in_full(features, descriptors, pixels, ctx.image_size)
+            options = ctx.image_size, ctx.finite
+            flat, rows, grid = _in_full(features, descriptors, pixels, *options)
             count, size = grid.shape[0], features.shape[-2:]
             # Only the gradient of the places reads the values of the maps.
             maps = rows @ flat if moves else rows.new_zeros(()).expand(count, 1, *size)
@@ -229,19 +239,19 @@ class _DotProducts(torch.autograd.Function):
             of_features = (rows.mT @ of_maps).reshape(features.shape).to(features.dtype)
             of_descriptors = (of_maps @ flat.mT).to(descriptors.dtype)
         if not moves:
-            return of_features, of_descriptors, None, None, None
+            return of_features, of_descriptors, None, None, None, None
         slope = normalizing(ctx.image_size, like=of_grid)[1]
         of_pixels = of_grid.reshape(pixels.shape) * slope
-        return of_features, of_descriptors, of_pixels.to(pixels.dtype), None, None
+        return of_features, of_descriptors, of_pixels.to(pixels.dtype), None, None, None
 
 
 def _in_full(
-    features: Tensor, descriptors: Tensor, pixels: Tensor, image_size: tuple[int, int]
+    features: Tensor, descriptors: Tensor, pixels: Tensor, image_size: tuple[int, int], finite: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Features ``(*B, D, h w)``, descriptors, grid ``(*B n, O, S, 2)`` in float32 at least."""
     features, descriptors = promoted(at_least_single(features), descriptors)
-    # A NaN would be in all products with it: of a zero gradient, too.
-    features, descriptors = (x.nan_to_num(0.0, 0.0, 0.0) for x in (features, descriptors))
+    if not finite:  # a NaN would be in all products with it: of a zero gradient, too
+        features, descriptors = (x.nan_to_num(0.0, 0.0, 0.0) for x in (features, descriptors))
     pixels = at_least_single(pixels)
     # One pass along rows of x, y, x, y: four, two numbers wide, take as long as the sampling.
     count = pixels.shape[-2]

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_pixels
-from deltas_geom.numerics.arithmetic import at_least_single
+from deltas_geom.numerics.arithmetic import at_least_single, numbers_or_zero, only, unless_all
 
 
 def length_table(feature_map: Tensor) -> tuple[Tensor]:
@@ -25,7 +25,7 @@ def length_table(feature_map: Tensor) -> tuple[Tensor]:
     def squared(values: Tensor) -> Tensor:
         return values.square().sum(dim=-3)
 
-    features = at_least_single(feature_map).nan_to_num(0.0, 0.0, 0.0)
+    features = numbers_or_zero(at_least_single(feature_map))
     along = right(features) - features
     length, step_x, step_y = squared(features), squared(along), squared(below(features) - features)
     twist = squared(below(along) - along)
@@ -49,9 +49,10 @@ def inverse_lengths(table: Tensor, pixels: Tensor, *, image_size: tuple[int, int
     squared = ((terms * of_x).sum(dim=-2) * of_y).sum(dim=-2)
     with torch.no_grad():
         ends = (terms[..., :2, :2, :] * of_x[..., :2, :]).sum(dim=-2) * of_y[..., :2, :]
-        has_length = squared > 16 * torch.finfo(squared.dtype).eps * ends.sum(dim=-2)
+        least = 16 * torch.finfo(squared.dtype).eps * ends.sum(dim=-2)
+        has_length = unless_all(squared > least)
     # Double where: the unused branch must not turn the gradient into NaN.
-    inverse = torch.where(has_length, torch.where(has_length, squared, 1.0).rsqrt(), 0.0)
+    inverse = only(only(squared, has_length, other=1.0).rsqrt(), has_length)
     return (inverse.reshape(pixels.shape[:-1]),)
 
 

@@ -12,7 +12,13 @@ from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
-from deltas_geom.numerics.arithmetic import finite_or_zero, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    both,
+    finite_or_zero,
+    only,
+    unless_all,
+    without_autocast,
+)
 from deltas_geom.records import Record
 
 
@@ -88,11 +94,12 @@ def soft_argmax(
     check_bool(mask=mask)
     if window is not None and window < 0:
         raise ValueError(f"window must not be negative, got {window}")
+    batches = [logits.shape[:-1], positions.shape[:-2], () if mask is None else mask.shape[:-1]]
     positions, known = finite_or_zero(positions)
-    possible = logits.isfinite() & known if mask is None else mask & logits.isfinite() & known
+    logits, finite = finite_or_zero(logits.expand(*batch_shape(*batches), -1), dims=0)
+    possible = both(both(mask, finite), None if known is None else known[..., 0])
     lowest = torch.finfo(logits.dtype).min / 4
-    probability = torch.where(possible, logits, lowest).softmax(dim=-1)
-    probability = torch.where(possible, probability, 0.0)
+    probability = only(only(logits, possible, other=lowest).softmax(dim=-1), possible)
     peak, place = probability.max(dim=-1)
     entropy = -torch.special.xlogy(probability, probability.clamp_min(1e-30)).sum(dim=-1)
     near = probability
@@ -101,7 +108,8 @@ def soft_argmax(
         near = torch.where((index - place[..., None]).abs() <= window, probability, 0.0)
     mass = near.sum(dim=-1)
     share = safe_divide(near, mass[..., None], (mass > 0)[..., None])
-    positions = torch.where(possible[..., None], positions, 0.0)  # far ones, to the square
+    if possible is not None:
+        positions = only(positions, possible[..., None])  # far ones, to the square
     position = (share[..., None] * positions).sum(dim=-2)
     offset = positions - position.unsqueeze(-2)
     covariance = (share[..., None] * offset).mT @ offset
@@ -124,6 +132,7 @@ def matches_from_sources(
     """
     batch = batch_shape(keypoints.shape[:-2], weights.shape[:-2])
     keypoints, known = finite_or_zero(keypoints)
+    known = None if known is None else known.mT  # beside the sources, as the mask is
     sources = (pixels, -3), (weights, -2), (covariance, -4), (mask, -2)
     pixels, weights, covariance, mask = (x.expand(*batch, *x.shape[dims:]) for x, dims in sources)
     anchor = keypoints.expand(*batch, *keypoints.shape[-2:]).unsqueeze(-3)
@@ -132,7 +141,7 @@ def matches_from_sources(
         torch.cat([anchor, pixels], dim=-3),
         torch.cat([ones, weights], dim=-2),
         torch.cat([torch.zeros_like(covariance[..., :1, :, :, :]), covariance], dim=-4),
-        torch.cat([known.expand_as(mask[..., 0, :]).unsqueeze(-2), mask], dim=-2),
+        torch.cat([only(torch.ones_like(mask[..., :1, :]), known, other=False), mask], dim=-2),
     )
 
 
@@ -167,9 +176,9 @@ def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor
     if not floor > 0:
         raise ValueError(f"floor must be positive, got {floor}")
     variance = (covariance[..., 0, 0] + covariance[..., 1, 1]) / 2 + floor**2
-    known = variance.isfinite() & (variance > 0)
+    known = unless_all(variance.isfinite() & (variance > 0))
     # Double where: the unused branch must not turn the gradient into NaN.
-    return torch.where(known, torch.where(known, variance, 1.0).rsqrt(), 0.0)
+    return only(only(variance, known, other=1.0).rsqrt(), known)
 
 
 @without_autocast
@@ -235,10 +244,10 @@ def match_joint(
     """
     check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N 1 M"))
     check_bool(mask=samples.mask)
-    scores = scores.squeeze(-2)
-    seen = samples.mask.squeeze(-2) & scores.isfinite()
+    scores, finite = finite_or_zero(scores.squeeze(-2), dims=0)
+    seen = only(samples.mask.squeeze(-2), finite, other=False)
     count = seen.sum(dim=-3)
-    mean = safe_divide(torch.where(seen, scores, 0.0).sum(dim=-3), count, count > 0)
+    mean = safe_divide(only(scores, seen).sum(dim=-3), count, count > 0)
     inv_depth = samples.inv_depth.select(-3, 0)
     found = soft_argmax(mean, inv_depth[..., None], mask=count > 0, window=window)
     return matches_at(

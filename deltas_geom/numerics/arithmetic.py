@@ -7,6 +7,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn import Parameter
 
 from deltas_geom.records import mapped, tensors_of
 
@@ -17,7 +18,10 @@ _HALF = (torch.float16, torch.bfloat16)
 
 def promoted(*tensors: Tensor) -> tuple[Tensor, ...]:
     """All in the dtype to which they promote, as a product of matrices does not by itself."""
-    dtype = reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
+    dtypes = [tensor.dtype for tensor in tensors]
+    if dtypes[1:] == dtypes[:-1]:
+        return tensors
+    dtype = reduce(torch.promote_types, dtypes)
     return tuple(tensor.to(dtype) for tensor in tensors)
 
 
@@ -33,7 +37,18 @@ def at_least_single(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
-def finite_or_zero(tensor: Tensor, dims: int = 1) -> tuple[Tensor, Tensor]:
+def surely_below(tensor: Tensor, limit: float = torch.inf) -> bool:
+    """Whether all numbers are smaller in size, and none NaN, where that may be asked at no cost.
+
+    What holds of all items need not be told from item to item, twice in each direction.
+    """
+    # One pass, and three for the largest. Where the sum of squares overflows the answer is no.
+    return values_at_hand(tensor) and torch.linalg.vector_norm(tensor.detach()).item() < limit
+
+
+def finite_or_zero(
+    tensor: Tensor, dims: int = 1, limit: float = torch.inf
+) -> tuple[Tensor, Tensor | None]:
     """The items that are finite, 0 without gradient in place of others, and which are.
 
     An operation that takes these, and puts its own 0 where the item is not finite, has a finite
@@ -43,16 +58,41 @@ def finite_or_zero(tensor: Tensor, dims: int = 1) -> tuple[Tensor, Tensor]:
     Args:
         tensor: ``(*B, ...)``, an item being its last ``dims`` dims.
         dims: 0 if an item is one number.
+        limit: of what counts as finite.
+
+    Returns:
+        Second, for :func:`only`: ``(*B, 1, ...)``, or None where all are known to be finite.
 
     Example:
         >>> finite_or_zero(torch.tensor([[torch.nan, 1.0], [2.0, 3.0]]))
         (tensor([[0., 0.],
-                [2., 3.]]), tensor([False,  True]))
+                [2., 3.]]), tensor([[False],
+                [ True]]))
     """
+    if surely_below(tensor, limit):
+        return tensor, None
     size = tensor.detach().abs()
     # NaN is not below infinity either, and the largest of numbers and NaN is NaN.
-    finite = (size.amax(dim=tuple(range(-dims, 0))) if dims else size) < torch.inf
-    return torch.where(finite[(..., *[None] * dims)], tensor, 0.0), finite
+    finite = (size.amax(dim=tuple(range(-dims, 0)), keepdim=True) if dims else size) < limit
+    return torch.where(finite, tensor, 0.0), finite
+
+
+def numbers_or_zero(tensor: Tensor) -> Tensor:
+    """Each number that is finite, 0 without gradient in place of others."""
+    return tensor if surely_below(tensor) else tensor.nan_to_num(0.0, 0.0, 0.0)
+
+
+def only(values: Tensor, *masks: Tensor | None, other: float = 0.0) -> Tensor:
+    """The values where all masks are True, a mask that is None being so; elsewhere ``other``."""
+    for mask in masks:
+        if mask is not None:
+            values = torch.where(mask, values, other)
+    return values
+
+
+def both(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Where two masks of :func:`finite_or_zero` are True; None where both are."""
+    return other if mask is None else mask if other is None else mask & other
 
 
 def without_autocast(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -77,12 +117,14 @@ def _called(
     @wraps(operation)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         tensors = tensors_of((*args, *kwargs.values()))
-        kind = tensors[0].device.type if tensors else "meta"
         # Asked first: an exported program that holds a region without autocast cannot be loaded.
-        if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
-            with torch.autocast(kind, enabled=False):
-                return called(*args, **kwargs)
-        if not any(tensor.dtype in _HALF for tensor in tensors):
+        if torch.compiler.is_compiling() or torch._C._is_any_autocast_enabled():
+            kind = tensors[0].device.type if tensors else "meta"
+            if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
+                with torch.autocast(kind, enabled=False):
+                    return called(*args, **kwargs)
+        # A list, and no generator: this is a third of the time of the smallest operations.
+        if not any([tensor.dtype in _HALF for tensor in tensors]):
             return operation(*args, **kwargs)
         options: Any = {name: mapped(_widened, value) for name, value in kwargs.items()}
         result = operation(*mapped(_widened, args), **options)
@@ -121,7 +163,12 @@ def values_at_hand(tensor: Tensor) -> bool:
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return False
-    return type(tensor) is Tensor and tensor.device.type == "cpu"
+    return type(tensor) in (Tensor, Parameter) and tensor.is_cpu
+
+
+def unless_all(mask: Tensor) -> Tensor | None:
+    """The mask for :func:`only`, or None where it is known to be True everywhere."""
+    return None if surely_all(mask) else mask
 
 
 def surely_all(mask: Tensor) -> bool:
