@@ -1,11 +1,26 @@
 """Triangulated points, and what is known about each."""
 
+from typing import Any, Protocol, Self, TypeVar
+
 import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_bool, check_depth_range, check_positive, check_shapes
 from deltas_geom.records import Record
 from deltas_geom.status import Status
+
+_R = TypeVar("_R", bound=Record)
+
+
+class Points(Protocol):
+    """What is common to the records of triangulated points."""
+
+    _fields: tuple[str, ...]
+
+    def __init__(self, **fields: Any) -> None: ...
+
+    def within_residual(self, max_residual: float) -> Self:
+        """The same without the points about which the views disagree by more."""
 
 
 class Triangulation(Record):
@@ -47,9 +62,7 @@ class Triangulation(Record):
         Raises:
             ValueError: it is not positive.
         """
-        check_positive(max_residual=max_residual)
-        kept = _without(self, self.residual > max_residual, Status.RESIDUAL_TOO_LARGE)
-        return kept._replace(errors=self.errors)
+        return refused_by_residual(self, max_residual)
 
     def within_depth(
         self, depth_range: tuple[float, float], *, view: int = 0, used: Tensor | None = None
@@ -83,12 +96,12 @@ class Triangulation(Record):
             tensor([2., 0.])
         """
         if used is None:
-            outside = _beyond(self.depth[..., view, :], depth_range)
+            outside = beyond(self.depth[..., view, :], depth_range)
         else:
             check_shapes(depth=(self.depth, "V N"), used=(used, "V N"))
             check_bool(used=used)
-            outside = (_beyond(self.depth, depth_range) & used).any(dim=-2)
-        return _without(self, outside, Status.OUT_OF_RANGE)
+            outside = (beyond(self.depth, depth_range) & used).any(dim=-2)
+        return without(self, outside, Status.OUT_OF_RANGE)
 
 
 class RobustTriangulation(Record):
@@ -118,35 +131,51 @@ class RobustTriangulation(Record):
 
     def within_residual(self, max_residual: float) -> "RobustTriangulation":
         """As :meth:`Triangulation.within_residual`, of the inliers."""
-        return self._kept(Triangulation(*self[:-1]).within_residual(max_residual))
+        return refused_by_residual(self, max_residual)
 
     def within_depth(self, depth_range: tuple[float, float]) -> "RobustTriangulation":
         """As :meth:`Triangulation.within_depth`, the range being that of every inlier."""
-        found = Triangulation(*self[:-1])
-        return self._kept(found.within_depth(depth_range, used=self.inliers))
-
-    def _kept(self, found: Triangulation) -> "RobustTriangulation":
-        inliers = self.inliers & found.valid.unsqueeze(-2)
-        return RobustTriangulation(**found._asdict(), inliers=inliers)
+        outside = (beyond(self.depth, depth_range) & self.inliers).any(dim=-2)
+        return without(self, outside, Status.OUT_OF_RANGE)
 
 
-def _beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
+def beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
+    """Which depths are nearer or farther than a range (near, far), metres."""
     check_depth_range(depth_range)
     near, far = depth_range
     return (depth < near) | (depth > far)
 
 
-def _without(found: Triangulation, outside: Tensor, reason: Status) -> Triangulation:
-    """The same, with those of ``(*B, N)`` that were valid failed for a reason."""
-    outside = found.valid & outside
-    cov = found.covariance
-    return Triangulation(
-        points=torch.where(outside[..., None], 0.0, found.points),
-        depth=torch.where(outside[..., None, :], 0.0, found.depth),
-        status=torch.where(outside, reason.value, found.status),
-        valid=found.valid & ~outside,
-        residual=torch.where(outside, 0.0, found.residual),
-        parallax=torch.where(outside, 0.0, found.parallax),
-        covariance=None if cov is None else torch.where(outside[..., None, None], 0.0, cov),
-        errors=torch.where(outside[..., None, :], 0.0, found.errors),
-    )
+def refused_by_residual(found: _R, max_residual: float, point: Tensor | None = None) -> _R:
+    """Any record of points :func:`without` those of a larger residual, but for its ``errors``."""
+    check_positive(max_residual=max_residual)
+    known: Any = found
+    kept = without(found, known.residual > max_residual, Status.RESIDUAL_TOO_LARGE, point)
+    return kept._replace(errors=known.errors)
+
+
+def without(found: _R, outside: Tensor, reason: Status, point: Tensor | None = None) -> _R:
+    """Any record of points with those of ``(*B, N)`` that were valid failed for a reason.
+
+    Args:
+        found: its fields are 0 there from now on, but for ``pixels``, which lose their gradient.
+        outside: bool, the points to refuse.
+        reason: why.
+        point: ``(T)`` index of each observation's point, if views are listed.
+    """
+    known = found._asdict()
+    outside = known["valid"] & outside
+    seen = outside.unsqueeze(-2) if point is None else outside[point]
+    which = dict.fromkeys(("depth", "errors", "inliers", "used"), seen)
+    which |= {"points": outside[..., None], "covariance": outside[..., None, None]}
+    which["pixels"] = seen[..., None]
+    changed: dict[str, Any] = {"status": torch.where(outside, reason.value, known["status"])}
+    for name, field in known.items():
+        if field is None or name in ("status", "point_index"):
+            continue
+        mask = which.get(name, outside)
+        if field.dtype == torch.bool:
+            changed[name] = field & ~mask
+        else:
+            changed[name] = torch.where(mask, field.detach() if name == "pixels" else 0.0, field)
+    return found._replace(**changed)

@@ -4,7 +4,7 @@ How the matrices were made, from pixels, rays or lists of observations, does not
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -12,11 +12,78 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.numerics.ldl import Symmetric4, Vector4, unit
 from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
+from deltas_geom.triangulation.judge import judge
 from deltas_geom.triangulation.observed import Vector3
 from deltas_geom.triangulation.rig_frame import RigFrame, squared_length
 
 # Of the inputs' rounding: an error of the solver that is lost in it.
 _NEGLIGIBLE = 0.01
+
+
+class Linear(Protocol):
+    """Equations of N homogeneous points, linear in them, each in its own frame."""
+
+    @property
+    def normal(self) -> Symmetric4:
+        """Ten ``(*B, N)``: the normal matrices."""
+
+    @property
+    def frame(self) -> RigFrame:
+        """Of the points."""
+
+    @property
+    def datum(self) -> Tensor:
+        """``(*B, 1, 3)`` the origin of the sums, in the world."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the inputs."""
+
+    def product(self, x: Vector4) -> Vector4:
+        """The normal matrices times vectors, by the rows: not squared."""
+
+    def in_front(self, points: Vector3) -> Tensor:
+        """Are points, relative to the datum, in front of all who see them? ``(*B, N)``."""
+
+
+class Solution(NamedTuple):
+    """Points, and what a derivative begins with.
+
+    Attributes:
+        points: three ``(*B, N)``, relative to the datum; anything if there is none.
+        vector: homogeneous, in the frame.
+    """
+
+    points: Vector3
+    vector: Vector4
+
+
+def solve_linear(equations: Linear) -> tuple[Solution, Tensor]:
+    """The points that minimise the algebraic error, without gradient, and their status."""
+    eps, frame = torch.finfo(equations.dtype).eps, equations.frame
+    # What the normal matrix loses of the rows' digits matters to those who have them.
+    polish = 2 if equations.dtype == torch.float64 else 0
+
+    def product(x: Vector4) -> Vector4:  # a compiler takes no bound method
+        return equations.product(x)
+
+    found = find_points(equations.normal, frame, eps=eps, product=product, polish=polish)
+    x, y, z = in_world(found.points, equations.datum)
+    held = x.abs() + y.abs() + z.abs() <= torch.finfo(equations.dtype).max
+    status = judge(
+        finite=frame.finite,
+        enough=frame.enough,
+        posed=found.posed,
+        near=found.near & held,
+        in_front=equations.in_front(found.points),
+    )
+    return Solution(found.points, found.vector), status
+
+
+def follow_linear(equations: Linear, found: Solution, valid: Tensor) -> Solution:
+    """The same, differentiably; finite where not valid."""
+    points = derivable_points(equations.normal, equations.frame, found.vector, valid)
+    return found._replace(points=points)
 
 
 class FoundPoints(NamedTuple):

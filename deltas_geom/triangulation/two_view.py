@@ -4,7 +4,6 @@ Two steps of Lindstrom's correction move the pair of pixels, as little as possib
 corresponding epipolar lines. Then the rays cross, exactly, and the point is there.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -14,24 +13,35 @@ from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import check_bool, check_floating, check_shapes
 from deltas_geom.epipolar.fundamental import cross_matrix
 from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
-from deltas_geom.numerics.chunks import cut_points
-from deltas_geom.numerics.evaluation import recomputed
+from deltas_geom.numerics.sums import product
+from deltas_geom.records import Record
 from deltas_geom.status import Status
+from deltas_geom.triangulation.bearings import dot
+from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
+from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.triangulation.operation import operation
+from deltas_geom.triangulation.reprojection import reproject
+from deltas_geom.triangulation.results import beyond, refused_by_residual, without
+from deltas_geom.triangulation.uncertainty import covariance_of, unpacked3
 
 
-class TwoViewTriangulation(NamedTuple):
+class TwoViewTriangulation(Record):
     """Points of two views, and the pixels at which the two see them.
 
     Attributes:
         points: ``(*B, N, 3)`` in the world, metres; (0, 0, 0) with zero gradient if not valid.
         pixels: ``(*B, 2, N, 2)`` corrected: the projections of the points. Those given, without
-            gradient, if not valid (0 where unused or not finite).
+            gradient, if not valid (0 where unused or not finite; corrected where the point was
+            refused by its residual or depth).
         depth: ``(*B, 2, N)`` along each camera's z axis, metres; 0 if not valid.
         status: ``(*B, N)`` int8 of :class:`Status`.
         valid: ``(*B, N)`` bool, status is OK.
         residual: ``(*B, N)`` RMS distance of corrected from given pixels, px; 0 if not valid.
         parallax: ``(*B, N)`` angle between the two rays at the point, rad; without gradient.
+        errors: ``(*B, 2, N)`` distance of corrected from given pixels, px; 0 if not valid.
+        covariance: ``(*B, N, 3, 3)`` for pixel noise of standard deviation 1 px, m^2; None unless
+            asked for; 0 if not valid.
     """
 
     points: Tensor
@@ -41,11 +51,30 @@ class TwoViewTriangulation(NamedTuple):
     valid: Tensor
     residual: Tensor
     parallax: Tensor
+    errors: Tensor
+    covariance: Tensor | None
+
+    def within_residual(self, max_residual: float) -> "TwoViewTriangulation":
+        """As :meth:`Triangulation.within_residual`; px."""
+        return refused_by_residual(self, max_residual)
+
+    def within_depth(
+        self, depth_range: tuple[float, float], *, view: int | None = None
+    ) -> "TwoViewTriangulation":
+        """As :meth:`Triangulation.within_depth`, the range being that of both views, or of one."""
+        outside = beyond(self.depth, depth_range)
+        outside = outside.any(dim=-2) if view is None else outside[..., view, :]
+        return without(self, outside, Status.OUT_OF_RANGE)
 
 
 @without_autocast
 def triangulate_two_view(
-    proj: Tensor, pixels: Tensor, mask: Tensor | None = None
+    proj: Tensor,
+    pixels: Tensor,
+    mask: Tensor | None = None,
+    *,
+    covariance: bool = False,
+    max_residual: float | None = None,
 ) -> TwoViewTriangulation:
     """Triangulate matched pixels of two views with the least squared reprojection error.
 
@@ -53,6 +82,9 @@ def triangulate_two_view(
         proj: ``(*B, 2, 3, 4)`` K [R | t].
         pixels: ``(*B, 2, N, 2)`` matches; those of unused views may hold anything.
         mask: ``(*B, 2, N)`` bool, True = used. Both views of a point have to be.
+        covariance: also compute the covariance of the points.
+        max_residual: px; points about which the views disagree by more are RESIDUAL_TOO_LARGE.
+            Pixels handed over as (N, 2, 2) where N = 2 have residuals of many pixels, too.
 
     Returns:
         Points, corrected pixels, status. Nothing raises or turns NaN because of values. At 1 px
@@ -61,6 +93,7 @@ def triangulate_two_view(
 
     Raises:
         ShapeError, TypeError: a trailing shape differs, the mask is not bool.
+        ValueError: ``max_residual`` is not positive.
 
     Source: Lindstrom, Triangulation Made Easy (CVPR 2010), algorithm niter2.
 
@@ -79,38 +112,17 @@ def triangulate_two_view(
     if mask is not None:
         check_shapes(pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
         check_bool(mask=mask)
-    dtype = torch.promote_types(proj.dtype, pixels.dtype)
-
-    def outward(seen: _Seen, solved: _Solved, status: Tensor) -> tuple[Tensor, ...]:
-        valid = status == Status.OK.value
-        both = valid.unsqueeze(-2)
-        mean = torch.where(both.unsqueeze(-2), solved.shift, 0.0).square().sum(dim=(-3, -2)) / 2
-        found = (
-            torch.where(valid[..., None], solved.points.mT, 0.0),
-            torch.where(both.unsqueeze(-2), seen.xy - solved.shift, seen.xy.detach()).mT,
-            torch.where(both, solved.depth, 0.0),
-            safe_sqrt(mean),
-            torch.where(valid, solved.parallax, 0.0),
-        )
-        limit = torch.finfo(dtype).max
-        return (*(value.to(dtype).clamp(-limit, limit) for value in found), status)
-
-    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
-        seen = _see(*inputs)
-        solved = _solve(seen)
-        return outward(seen, solved, _judge(seen, solved, dtype))
-
-    def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
-        seen = _see(*inputs)
-        with torch.no_grad():
-            status = _judge(seen, _solve(seen), dtype)
-        return outward(seen, _solve(seen, status == Status.OK.value), status)
-
-    cut = cut_points(pixels, -2, -1, outputs=(-2, -2, -1, -1, -1, -1))
-    found = recomputed(derivable, proj, pixels, mask, values=values, cut=cut)
-    points, corrected, depth, residual, parallax, status = found
-    valid = status == Status.OK.value
-    return TwoViewTriangulation(points, corrected, depth, status, valid, residual, parallax)
+    return operation(
+        TwoViewTriangulation,
+        (proj, pixels, mask),
+        see=_see,
+        solve=_judged,
+        follow=lambda seen, _, valid: _solve(seen, valid),
+        describe=_describe,
+        dtype=torch.promote_types(proj.dtype, pixels.dtype),
+        covariance=covariance,
+        max_residual=max_residual,
+    )
 
 
 class _Rig(NamedTuple):
@@ -159,12 +171,16 @@ class _Seen(NamedTuple):
         xy: ``(*B, 2, 2, N)`` px, 0 where unused or not finite.
         finite: ``(*B, N)`` bool: everything used is.
         enough: ``(*B, N)`` bool: both views are used.
+        proj: ``(*B, 2, 3, 4)`` those cameras.
+        dtype: of the inputs.
     """
 
     rig: _Rig
     xy: Tensor
     finite: Tensor
     enough: Tensor
+    proj: Tensor
+    dtype: torch.dtype
 
 
 def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
@@ -176,9 +192,11 @@ def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
     known = (camera.abs() < limit).all(-1).all(-1)
     finite = (xy.abs() < limit).all(dim=-2) & known[..., None]
     used = torch.zeros_like(finite) | used
-    rig = _rig(torch.where(known[..., None, None], camera, 0.0))
+    camera = torch.where(known[..., None, None], camera, 0.0)
     xy = torch.where((finite & used).unsqueeze(-2), xy, 0.0)
-    return _Seen(rig, xy, finite=(finite | ~used).all(dim=-2), enough=used.all(dim=-2))
+    known, enough = (finite | ~used).all(dim=-2), used.all(dim=-2)
+    dtype = torch.promote_types(proj.dtype, pixels.dtype)
+    return _Seen(_rig(camera), xy, known, enough, camera, dtype)
 
 
 class _Solved(NamedTuple):
@@ -207,68 +225,30 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
 
     rig = seen.rig
     xy = seen.xy if valid is None else torch.where(valid[..., None, None, :], seen.xy, 0.0)
-    shift = _correction(rig.fundamental, xy, safe)
+    shift = correction(rig.fundamental, xy, safe)
     inverse = rig.world_from_pixel
-    ray = inverse[..., :2] @ (xy - shift) + inverse[..., 2:]
+    ray = product(inverse[..., :2], xy - shift) + inverse[..., 2:]
     size = safe(ray.detach().abs().amax(dim=-2))
     ray = ray / size.unsqueeze(-2)
     # By components, which costs half of torch.linalg.cross and its gradient.
-    first, second = (one.unbind(dim=-2) for one in ray.unbind(dim=-3))
-    baseline = rig.centers.diff(dim=-2).mT.unbind(dim=-2)
+    first, second = (_components(one) for one in ray.unbind(dim=-3))
+    baseline = _components(rig.centers.diff(dim=-2).mT)
     across = _cross(first, second)
     passing = _cross(baseline, second), _cross(baseline, first)
-    squared = _dot(across, across)
-    along = torch.stack([_dot(one, across) for one in passing], dim=-2)
+    squared = dot(across, across)
+    along = torch.stack([dot(one, across) for one in passing], dim=-2)
     along = along / safe(squared).unsqueeze(-2)
     # From both cameras, so that their order does not count.
     points = (rig.centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
     with torch.no_grad():
-        beside = torch.stack([_dot(one, one).sqrt() for one in passing], dim=-2)
-        parallax = torch.atan2(squared.sqrt(), _dot(first, second))
+        beside = torch.stack([dot(one, one).sqrt() for one in passing], dim=-2)
+        parallax = torch.atan2(squared.sqrt(), dot(first, second))
     return _Solved(points, shift, along / size, parallax, beside)
 
 
-def _correction(fundamental: Tensor, xy: Tensor, safe: Callable[[Tensor], Tensor]) -> Tensor:
-    """What to take from pixels ``(*B, 2, 2, N)`` so that the rays of each pair meet, px."""
-    x1, x2 = xy.unbind(dim=-3)
-    # Normals of the epipolar lines, and the epipolar error.
-    a1, b1, last = (fundamental[..., :2] @ x2 + fundamental[..., 2:]).unbind(dim=-2)
-    back = fundamental[..., :2].mT
-    a2, b2 = (back[..., :2] @ x1 + back[..., 2:]).unbind(dim=-2)
-    error = a1 * x1[..., 0, :] + b1 * x1[..., 1, :] + last
-    # In units of the longer normal all that follows is in pixels, near the epipoles too.
-    share = 1 / safe(torch.stack([a1, b1, a2, b2]).detach().abs().amax(dim=0))
-    a1, b1, a2, b2, error = (value * share for value in (a1, b1, a2, b2, error))
-    f00, f01, f10, f11 = (fundamental[..., i, j, None] * share for i in (0, 1) for j in (0, 1))
-
-    # The pair that moves by k times its normals meets where error - 2 half k + curve k^2 = 0.
-    da1, db1 = f00 * a2 + f01 * b2, f10 * a2 + f11 * b2
-    da2, db2 = f00 * a1 + f10 * b1, f01 * a1 + f11 * b1
-    curve = a1 * da1 + b1 * db1
-    squared1, squared2 = a1 * a1 + b1 * b1, a2 * a2 + b2 * b2
-    half = (squared1 + squared2) / 2
-    under = half * half - curve * error
-    real = under > 0
-    root = torch.where(real, under, 1.0).sqrt()
-    # Gross errors near the epipoles have no such pair: there one pixel moves to the other's line.
-    k = error / safe(torch.where(real, half + root, torch.maximum(squared1, squared2)))
-    k1 = torch.where(real | (squared1 >= squared2), k, 0.0)
-    k2 = torch.where(real | (squared1 < squared2), k, 0.0)
-
-    # The lines through that pair correspond: the given pixels' nearest on them meet exactly.
-    def moved(k: Tensor, a: Tensor, b: Tensor, new_a: Tensor, new_b: Tensor) -> Tensor:
-        share = k * (a * new_a + b * new_b) / safe(new_a * new_a + new_b * new_b)
-        return torch.stack([share * new_a, share * new_b], dim=-2)
-
-    first = moved(k1, a1, b1, a1 - k2 * da1, b1 - k2 * db1)
-    second = moved(k2, a2, b2, a2 - k1 * da2, b2 - k1 * db2)
-    return torch.stack([first, second], dim=-3)
-
-
-@torch.no_grad()
-def _judge(seen: _Seen, solved: _Solved, dtype: torch.dtype) -> Tensor:
-    """Status ``(*B, N)`` int8."""
-    rig, eps = seen.rig, torch.finfo(dtype).eps
+def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
+    """Points, and their status ``(*B, N)`` int8."""
+    rig, eps, solved = seen.rig, torch.finfo(seen.dtype).eps, _solve(seen)
     length = rig.centers.diff(dim=-2).norm(dim=-1)
     size = rig.centers.norm(dim=-1).amax(dim=-1)[..., None]
     # Centres closer together than the rounding of where they are do not differ. On the baseline
@@ -277,16 +257,40 @@ def _judge(seen: _Seen, solved: _Solved, dtype: torch.dtype) -> Tensor:
     posed = (length > 128 * eps * size) & (farther > 8 * eps * (size + length))
     # The law of sines: the baseline and a distance, without the point, which may be anywhere.
     near = solved.parallax.sin() * length > 32 * eps * farther
-    near = near & solved.points.to(dtype).isfinite().all(dim=-2)
+    near = near & solved.points.to(seen.dtype).isfinite().all(dim=-2)
     # At a camera's centre the depth is 0 within rounding.
     apart = solved.beside > 64 * torch.finfo(length.dtype).eps * length.unsqueeze(-2)
     in_front = (apart & (solved.depth > 0)).all(dim=-2)
-    return judge(finite=seen.finite, enough=seen.enough, posed=posed, near=near, in_front=in_front)
+    status = judge(
+        finite=seen.finite, enough=seen.enough, posed=posed, near=near, in_front=in_front
+    )
+    return solved, status
 
 
-def _cross(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def _describe(seen: _Seen, solved: _Solved, valid: Tensor, covariance: bool) -> dict[str, Tensor]:
+    both = valid.unsqueeze(-2)
+    squared = torch.where(both.unsqueeze(-2), solved.shift, 0.0).square().sum(dim=-2)
+    points = torch.where(both, solved.points, 0.0)
+    found = {
+        "points": points.mT,
+        "pixels": torch.where(both.unsqueeze(-2), seen.xy - solved.shift, seen.xy.detach()).mT,
+        "depth": torch.where(both, solved.depth, 0.0),
+        "residual": safe_sqrt(squared.mean(dim=-2)),
+        "parallax": torch.where(valid, solved.parallax, 0.0),
+        "errors": safe_sqrt(squared),
+    }
+    if covariance:
+        x, y, z = points.unbind(dim=-2)
+        again = reproject(seen.proj, (x, y, z), both.expand_as(squared))
+        noise = covariance_of(seen.proj, again, torch.ones_like(squared))
+        found["covariance"] = unpacked3(noise)
+    return found
+
+
+def _components(vector: Tensor) -> Vector3:
+    x, y, z = vector.unbind(dim=-2)
+    return x, y, z
+
+
+def _cross(a: Vector3, b: Vector3) -> Vector3:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _dot(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> Tensor:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

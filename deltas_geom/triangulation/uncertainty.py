@@ -1,5 +1,7 @@
 """What is known about given points: residual, parallax, covariance."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -7,12 +9,7 @@ from deltas_geom.checks import batch_shape, check_bool, check_floating, check_sh
 from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
 from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
-from deltas_geom.triangulation.observed import (
-    Cameras,
-    Vector3,
-    cameras_of,
-    clean_pixels,
-)
+from deltas_geom.triangulation.observed import Cameras, Vector3, cameras_of, clean_pixels
 from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
 from deltas_geom.triangulation.weights import check_weights, weigh
 
@@ -158,10 +155,8 @@ def point_covariance(
     weighed = weigh(weights, mask, batch=batch, like=like, sound=sound.unsqueeze(-1))
     used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
     seen = reproject(cameras.proj, places, used)
-    of_pixels = unpacked3(covariance_of(cameras.proj, seen, weighed.squared))
-    unit = weighed.largest.squeeze(-2)[..., None, None]
-    # Divided twice: the square of a small weight may be 0.
-    found = of_pixels / unit / unit
+    entries = covariance_of(cameras.proj, seen, weighed.squared)
+    found, of_pixels = unscaled(entries, weighed.largest.squeeze(-2)), unpacked3(entries)
     if noise is not None:
         # Double where: products of what is as good as infinite would be NaN.
         finite = torch.where(_fits(of_pixels, torch.finfo(work).max ** 0.75), of_pixels, 0.0)
@@ -238,10 +233,14 @@ def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetr
     """
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
     # The derivative of a pixel by the point is its equations, divided by the depth.
-    normal = normal_matrix(normal_coefficients(proj[..., :3]), found.x, found.y, by_depth)
-    enough = found.seen.sum(dim=-2) >= 2
+    information = normal_matrix(normal_coefficients(proj[..., :3]), found.x, found.y, by_depth)
+    return inverse_information(information, found.seen.sum(dim=-2) >= 2)
+
+
+def inverse_information(normal: Sequence[Tensor], enough: Tensor) -> Symmetric3:
+    """Inverses, six ``(*B, N)``; 0 unless ``enough``, and as of :func:`covariance_of`."""
     with torch.no_grad():
-        trace, limit = normal[0] + normal[3] + normal[5], torch.finfo(by_depth.dtype).max
+        trace, limit = normal[0] + normal[3] + normal[5], torch.finfo(normal[0].dtype).max
         ordinary = enough & (trace > limit**-0.45) & (trace < limit**0.45)
         unit = torch.where(ordinary, trace, 1.0)
     # Double where: what has no inverse must pass no gradient and no NaN.
@@ -256,8 +255,15 @@ def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetr
 def unpacked3(entries: Symmetric3) -> Tensor:
     """Symmetric matrices ``(*B, N, 3, 3)`` from six ``(*B, N)``."""
     xx, xy, xz, yy, yz, zz = entries
-    # Not an index, which is copied to the device and waited for.
+    # Not an index: it would be copied to the device.
     return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(*xx.shape, 3, 3)
+
+
+def unscaled(entries: Symmetric3, largest: Tensor) -> Tensor:
+    """Covariances ``(*B, N, 3, 3)`` from those of weights whose largest, ``(*B, N)``, was 1."""
+    unit = largest[..., None, None]
+    # Divided twice: the square of a small weight may be 0.
+    return unpacked3(entries) / unit / unit
 
 
 def _of_poses(

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from operations import tensors_of
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -284,7 +285,7 @@ def test_named_scenes_have_the_status_of_dlt(name: str, dtype: torch.dtype) -> N
     assert torch.equal(result.status, wanted.status)
     assert_close(result.points, wanted.points, rtol=1e-5, atol=1e-5)  # m
     total = result.points.sum() + result.residual.sum() + result.pixels.sum() + result.depth.sum()
-    for value in (*result, *torch.autograd.grad(total, (proj, pixels))):
+    for value in (*tensors_of(result), *torch.autograd.grad(total, (proj, pixels))):
         assert value.isfinite().all()
 
 
@@ -365,7 +366,7 @@ def test_no_finite_input_gives_nan_or_inf(pixels: Tensor, proj: Tensor, wild: bo
             for value in (proj if wild else right_angle().views.proj, pixels)
         ]
         result = triangulate_two_view(*inputs)
-        assert all(value.isfinite().all() for value in result)
+        assert all(value.isfinite().all() for value in tensors_of(result))
         total = (
             result.points.sum() + result.depth.sum() + result.residual.sum() + result.pixels.sum()
         )

@@ -1,0 +1,140 @@
+"""Rays of posed cameras in the solver's type, cleaned and flagged; and points as these see them.
+
+Everything downstream may multiply and divide without asking: what is not used passes no NaN and no
+gradient.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
+from deltas_geom.checks import check_floating, check_shapes
+from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
+from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.triangulation.reprojection import mean_of, parallax_of
+from deltas_geom.triangulation.rig_frame import datum_of, squared_length
+from deltas_geom.triangulation.solution import in_world, kept
+from deltas_geom.triangulation.uncertainty import inverse_information, unscaled
+from deltas_geom.triangulation.weights import Weights, check_weights, weigh
+
+
+class Bearings(NamedTuple):
+    """Rays of N points from V views.
+
+    Attributes:
+        centers: ``(*B, V, 3)`` of the cameras; 0 if not finite.
+        datum: ``(*B, 1, 3)`` a place near the cameras, from which points are counted.
+        broken: ``(*B, V)`` 1 for cameras that are not finite, else 0.
+        directions: three ``(*B, V, N)`` unit, in the world; any where unsound.
+        weights: of the rays.
+        dtype: of the inputs.
+    """
+
+    centers: Tensor
+    datum: Tensor
+    broken: Tensor
+    directions: Vector3
+    weights: Weights
+    dtype: torch.dtype
+
+    def offsets(self, points: Vector3) -> Vector3:
+        """From the centres to points three ``(*B, N)`` beside the datum: three ``(*B, V, N)``."""
+        centers = (self.centers - self.datum)[..., None].unbind(dim=-2)
+        x, y, z = (p.unsqueeze(-2) - c for p, c in zip(points, centers, strict=True))
+        return x, y, z
+
+    def in_front(self, points: Vector3) -> Tensor:
+        """Is each point ahead on all its used rays, by more than rounding? ``(*B, N)``."""
+        with torch.no_grad():
+            along = dot(self.directions, self.offsets(points))
+            x, y, z = in_world(points, self.datum)
+            # At a camera's centre, within rounding, a point has no angle.
+            size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()).unsqueeze(-2)
+            size = size + self.centers.abs().amax(dim=-1)[..., None]
+            ahead = along > 64 * torch.finfo(along.dtype).eps * size
+            return (ahead | self.weights.unused).all(dim=-2)
+
+
+def check_bearings(
+    cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> torch.Size:
+    """The batch dims to which all broadcast; raise unless rays ``(*B, V, N, 3)`` fit cameras."""
+    check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), rays=(rays, "V N 3"))
+    check_floating(cam_from_world=cam_from_world, rays=rays)
+    return check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
+
+
+def see_rays(
+    cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> Bearings:
+    """Tell used rays ``(*B, V, N, 3)`` of cameras ``(*B, V, 4, 4)`` from others."""
+    work = solver_dtype(rays)
+    batch = check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
+    pose = cam_from_world[..., :3, :].to(work)  # whatever the last row
+    x, y, z = (one.to(work, memory_format=torch.contiguous_format) for one in rays.unbind(dim=-1))
+    with torch.no_grad():
+        # Squares of what is let through can be represented. NaN is not let through.
+        posed = (pose.abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)
+        length = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+        sound = (length > 0) & (length <= torch.finfo(work).max)
+    # Double where throughout: what is not used must pass no gradient and no NaN.
+    pose = torch.where(posed[..., None, None], pose, 0.0)
+    # Divided by its largest coordinate it cannot overflow when squared.
+    x, y, z = (safe_divide(one, length, sound) for one in (x, y, z))
+    a, b, c = pose[..., :3].unsqueeze(-2).unbind(dim=-3)  # each (*B, V, 1, 3)
+    x, y, z = (dot((x, y, z), (a[..., i], b[..., i], c[..., i])) for i in range(3))
+    square = squared_length((x, y, z))
+    # A pose that is no rotation may turn a ray into nothing.
+    sound = sound & posed.unsqueeze(-1) & (square.detach() > torch.finfo(work).tiny ** 0.4)
+    every = surely_all(sound)
+    inverse = square.rsqrt() if every else torch.where(sound, square, 1.0).rsqrt()
+    centers = -(pose[..., :3] * pose[..., 3:]).sum(dim=-2)
+    weighed = weigh(weights, mask, batch=batch, like=rays, sound=None if every else sound)
+    directions = (x * inverse, y * inverse, z * inverse)
+    return Bearings(centers, datum_of(centers), (~posed).to(work), directions, weighed, rays.dtype)
+
+
+def describe_rays(
+    seen: Bearings, points: Vector3, valid: Tensor, covariance: bool
+) -> dict[str, Tensor]:
+    """The fields of a :class:`Triangulation` of points three ``(*B, N)`` beside the datum."""
+    points, weights, both = kept(points, valid), seen.weights, valid.unsqueeze(-2)
+    used = ~weights.unused & both
+    offset = seen.offsets(points)
+    along = dot(seen.directions, offset)
+    # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
+    sine = safe_sqrt(torch.where(used, squared_length(across(seen.directions, offset)), 0.0))
+    angle = torch.atan2(sine, torch.where(used, along, 1.0))
+    place = kept(in_world(points, seen.datum), valid)
+    found = {
+        "points": torch.stack(place, dim=-1),
+        "depth": torch.where(both, along, 0.0),
+        "residual": mean_of(angle.square(), used, weights.squared),
+        "parallax": parallax_of(seen.centers - seen.datum, points, used.to(along.dtype)),
+        "errors": angle,
+    }
+    if covariance:
+        # The noise of a ray, times the distance, moves its line across itself alone.
+        share = safe_divide(weights.squared.expand_as(along), squared_length(offset), used)
+        share = safe_divide(share, squared_length(offset), used)
+        x, y, z = offset
+        xx, yy, zz = x * x, y * y, z * z
+        entries = (yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy)
+        xx, xy, xz, yy, yz, zz = ((share * entry).sum(dim=-2) for entry in entries)
+        inverse = inverse_information((xx, xy, xz, yy, yz, zz), used.sum(dim=-2) >= 2)
+        found["covariance"] = unscaled(inverse, weights.largest.squeeze(-2))
+    return found
+
+
+def dot(a: Vector3, b: Vector3) -> Tensor:
+    """Products of vectors whose components broadcast."""
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
+
+
+def across(directions: Vector3, vector: Vector3) -> Vector3:
+    """The part of vectors orthogonal to unit directions."""
+    along = dot(directions, vector)
+    x, y, z = (part - d * along for part, d in zip(vector, directions, strict=True))
+    return x, y, z
