@@ -96,3 +96,6 @@ class Diagnosis(NamedTuple):
             names = ", ".join(dict.fromkeys(other.cause.name for other in self.untold))
             lines.append(f"  these matches cannot tell: {names}, one scale of all translations")
         return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"<Diagnosis {self.cause.name}: {self.sentence}>"
