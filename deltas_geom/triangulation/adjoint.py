@@ -19,20 +19,21 @@ from deltas_geom.triangulation.equations import Equations, Rig, out_of_frame
 from deltas_geom.triangulation.observed import Observations, Vector3, homogeneous_in_views, inverted
 from deltas_geom.triangulation.rig_frame import squared_length
 from deltas_geom.triangulation.solution import of_trace_one
+from deltas_geom.triangulation.weights import Weights
 
 
 class Gradients(NamedTuple):
-    """Of the sum of gradient * points, in the solver's type; broadcast as the inputs were.
+    """Of the sum of gradient * points; broadcast as the inputs were.
 
     Attributes:
         proj: ``(*B, V, 3, 4)``, or None where not asked for.
         pixels: ``(*B, V, N, 2)``.
-        weights: ``(*B, V, N)`` by the squared weights.
+        weights: ``(*B, V, N)``, or None where there are none.
     """
 
     proj: Tensor | None
     pixels: Tensor
-    weights: Tensor
+    weights: Tensor | None
 
 
 class _Pull(NamedTuple):
@@ -51,7 +52,14 @@ class _Pull(NamedTuple):
 
 
 def gradients_of(
-    equations: Equations, vector: Vector4, valid: Tensor, gradient: Vector3, *, of_cameras: bool
+    equations: Equations,
+    vector: Vector4,
+    valid: Tensor,
+    gradient: Vector3,
+    *,
+    weights: Tensor | None,
+    of_cameras: bool,
+    dtype: torch.dtype,
 ) -> Gradients:
     """Gradients of what the equations were made of, to first order.
 
@@ -60,34 +68,46 @@ def gradients_of(
         vector: their null vectors in the frame; anything where not valid.
         valid: ``(*B, N)`` bool.
         gradient: three ``(*B, N)`` by the points.
+        weights: ``(*B, V, N)`` as they were given; None if they need no gradient.
         of_cameras: are those by the cameras wanted, too?
+        dtype: of the pixels.
     """
     pull = _pulled(equations, vector, valid, gradient)
-    rig, of_cameras_and_frames = equations.rig, []
+    rig, sums = equations.rig, []
 
     def of_part(part: Observations, *rows: Tensor) -> tuple[Tensor, ...]:
         x, y, known = part
-        place, push, framed = rows[:4], rows[4:8], rows[8:]
+        place, push, framed, signs = rows[:4], rows[4:8], rows[8:13], rows[13:]
         (a, b, c), (d, e, f) = (homogeneous_in_views(rig.near, some) for some in (place, push))
         across, down, along, below = x * c - a, y * c - b, x * f - d, y * f - e
-        by_weight = product(rig.moments[0].mT, torch.stack(framed, dim=-2))
-        by_weight = by_weight - torch.addcmul(across * along, down, below)
         by_x = torch.addcmul(f * across, c, along) * -known.squared
         by_y = torch.addcmul(f * down, c, below) * -known.squared
+        found: tuple[Tensor, ...] = (torch.stack([by_x.to(dtype), by_y.to(dtype)], dim=-1),)
+        if signs:
+            by_weight = product(rig.moments[0].mT, torch.stack(framed, dim=-2))
+            by_weight = by_weight - torch.addcmul(across * along, down, below)
+            found = (*found, (by_weight * _slope(known, signs[0])).to(signs[0].dtype))
         if of_cameras:
-            sums = [torch.stack(some, dim=-2) for some in (place, push, framed[1:])]
-            of_cameras_and_frames.append(_over_points(part, (across, down), (along, below), *sums))
-        return by_x, by_y, by_weight
+            stacked = [torch.stack(some, dim=-2) for some in (place, push, framed[1:])]
+            sums.append(_over_points(part, (across, down), (along, below), *stacked))
+        return found
 
     rows = (*pull.place, *pull.push, *pull.framed)
-    by_x, by_y, by_weight = equations.each(of_part, *rows)
-    pixels, proj = torch.stack([by_x, by_y], dim=-1), None
+    if weights is None:
+        pixels, *by_weights = equations.each(of_part, *rows, dims=(-2,))
+    else:
+        pixels, *by_weights = equations.each(of_part, *rows, weights, dims=(-2, -1))
+    proj = None
     if of_cameras:
-        near, centers = (
-            sum(some[1:], some[0]) for some in zip(*of_cameras_and_frames, strict=True)
-        )
+        near, centers = (sum(some[1:], some[0]) for some in zip(*sums, strict=True))
         proj = _of_cameras(rig, near, centers)
-    return Gradients(proj, pixels, by_weight)
+    return Gradients(proj, pixels, by_weights[0] if by_weights else None)
+
+
+def _slope(known: Weights, weights: Tensor) -> Tensor:
+    """Derivative of the squared weights by the weights ``(*B, V, N)``, 0 where unused."""
+    share = torch.where(known.squared > 0, weights, 0.0) / known.largest
+    return 2 * share / known.largest
 
 
 def _over_points(
@@ -135,16 +155,6 @@ def _pulled(equations: Equations, vector: Vector4, valid: Tensor, gradient: Vect
     linear = [a - twice * o for a, o in zip(alpha, (ox, oy, oz), strict=True)]
     framed = (constant, beta, *linear)
     return _Pull(out_of_frame(frame, x), out_of_frame(frame, y), framed)
-
-
-def weight_slope(equations: Equations, weights: Tensor) -> Tensor:
-    """Derivative of the squared weights by the weights ``(*B, V, N)``, 0 where unused."""
-
-    def slope(part: Observations, weight: Tensor) -> tuple[Tensor]:
-        known = part.weights
-        return (2 * torch.copysign(known.squared.sqrt(), weight) / known.largest,)
-
-    return equations.each(slope, weights)[0]
 
 
 def _of_cameras(rig: Rig, near: Tensor, centers: Tensor) -> Tensor:

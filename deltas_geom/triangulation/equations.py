@@ -69,9 +69,15 @@ class Equations(NamedTuple):
     fixed: bool
 
     def each(
-        self, function: Callable[..., tuple[Tensor, ...]], *points: Tensor
+        self,
+        function: Callable[..., tuple[Tensor, ...]],
+        *points: Tensor,
+        dims: Sequence[int] | None = None,
     ) -> tuple[Tensor, ...]:
-        """``function(part, *points)`` of points ``(..., N)``, part by part, its results joined."""
+        """``function(part, *points)`` of points ``(..., N)``, part by part, its results joined.
+
+        Along the last dim, or the ``dims`` given.
+        """
         if len(self.parts) == 1:
             return function(self.parts[0], *points)
         found, start = [], 0
@@ -79,7 +85,8 @@ class Equations(NamedTuple):
             count = part.x.shape[-1]
             found.append(function(part, *(tensor.narrow(-1, start, count) for tensor in points)))
             start += count
-        return tuple(joined(some, -1) for some in zip(*found, strict=True))
+        columns = list(zip(*found, strict=True))
+        return tuple(map(joined, columns, dims or [-1] * len(columns)))
 
 
 def rig_of(proj: Tensor) -> Rig:

@@ -12,7 +12,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.numerics.ldl import Vector4
-from deltas_geom.triangulation.adjoint import gradients_of, weight_slope
+from deltas_geom.triangulation.adjoint import gradients_of
 from deltas_geom.triangulation.equations import (
     Alike,
     Equations,
@@ -165,23 +165,22 @@ class LongWay(NamedTuple):
             used = ~weights.unused & valid
             found = reproject(cameras.proj, (x, y, z), used)
             squared = squared_errors(found, px, py)
-            outward: tuple[Tensor, ...] = (
-                found.depth if surely_all(valid) else torch.where(valid, found.depth, 0.0),
-                mean_of(squared, found.seen, weights.squared),
-                parallax_of(cameras.centers, (x, y, z), used.to(found.x.dtype)),
-                safe_sqrt(squared),
-            )
+            outward = [
+                self._fitting(one)
+                for one in (
+                    found.depth if surely_all(valid) else torch.where(valid, found.depth, 0.0),
+                    mean_of(squared, found.seen, weights.squared),
+                    parallax_of(cameras.centers, (x, y, z), used.to(found.x.dtype)),
+                    safe_sqrt(squared),
+                )
+            ]
             if covariance:
-                noise = covariance_of(cameras.proj, found, weights.squared)
-                outward = (*outward, *noise, weights.largest.squeeze(-2).expand_as(x))
-            return outward
+                outward += covariance_of(cameras.proj, found, weights.squared)
+                outward.append(weights.largest.squeeze(-2).expand_as(x))
+            return tuple(outward)
 
         depth, residual, parallax, errors, *noise = equations.each(seen, valid, *points)
-        limit = torch.finfo(self.dtype).max
-        described = tuple(
-            tensor.to(self.dtype).clamp(-limit, limit)
-            for tensor in (torch.stack(points, dim=-1), depth, residual, parallax, errors)
-        )
+        described: tuple[Tensor, ...] = (self.outward(points), depth, residual, parallax, errors)
         if covariance:
             xx, xy, xz, yy, yz, zz, largest = noise
             unit = largest[..., None, None]
@@ -200,14 +199,23 @@ class LongWay(NamedTuple):
     ) -> tuple[Tensor | None, ...]:
         """Gradients by cameras, pixels and weights of points with this gradient."""
         solved = self.solve(self.see(pixels, weights, mask))
-        gx, gy, gz = gradient.to(solved.points[0].dtype).unbind(dim=-1)
-        equations, valid = solved.equations, ok(solved.status)
-        found = gradients_of(equations, solved.vector, valid, (gx, gy, gz), of_cameras=needed[0])
-        by_weights = None
-        if weights is not None and needed[2]:
-            by_weights = found.weights * weight_slope(equations, weights)
-        return found.proj, found.pixels if needed[1] else None, by_weights
+        work = solved.points[0].dtype
+        gx, gy, gz = (component.to(work) for component in gradient.unbind(dim=-1))
+        found = gradients_of(
+            solved.equations,
+            solved.vector,
+            ok(solved.status),
+            (gx, gy, gz),
+            weights=weights if needed[2] else None,
+            of_cameras=needed[0],
+            dtype=pixels.dtype,
+        )
+        return found.proj, found.pixels, found.weights
 
     def outward(self, points: Vector3) -> Tensor:
         """Three ``(*B, N)`` as ``(*B, N, 3)`` of the caller's type."""
-        return torch.stack(points, dim=-1).to(self.dtype)
+        return torch.stack([self._fitting(component) for component in points], dim=-1)
+
+    def _fitting(self, values: Tensor) -> Tensor:
+        limit = torch.finfo(self.dtype).max
+        return values.clamp(-limit, limit).to(self.dtype)

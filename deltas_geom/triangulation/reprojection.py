@@ -31,7 +31,11 @@ class Reprojection(NamedTuple):
 
 def reproject(proj: Tensor, points: Vector3, used: Tensor) -> Reprojection:
     """Project finite points, three ``(*B, N)``, into the used views ``(*B, V, N)``."""
-    x, y, z = homogeneous_in_views(proj, (*points, torch.ones_like(points[0])))
+    return projected(*homogeneous_in_views(proj, (*points, torch.ones_like(points[0]))), used)
+
+
+def projected(x: Tensor, y: Tensor, z: Tensor, used: Tensor) -> Reprojection:
+    """The same of homogeneous pixels."""
     info = torch.finfo(z.dtype)
     with torch.no_grad():
         # Far above the smallest number, so that squares of the inverse are finite.
@@ -97,4 +101,8 @@ def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
             apart = apart * (used[..., one, :] * used[..., rest, :])
         chord = torch.maximum(chord, apart.amax(dim=-2))
     # The chord keeps small angles that the arc cosine of a dot product rounds away.
-    return 2 * torch.asin((0.5 * chord.sqrt()).clamp(max=1))
+    # Neither asin nor sqrt, for which torch starts threads from 2048 numbers on.
+    square = (0.25 * chord).clamp(min=tiny, max=1)
+    other = (1 - square).clamp(min=tiny)
+    angle = 2 * torch.atan2(square * square.rsqrt(), other * other.rsqrt())
+    return torch.where(chord > 0, angle, 0.0)

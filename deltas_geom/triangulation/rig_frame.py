@@ -104,7 +104,7 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         apart = spread > 1e-3 * torch.finfo(size.dtype).eps * size
     if not surely_all(apart):
         spread = torch.where(apart, spread, 1.0)
-    length = spread.sqrt()
+    length = spread * spread.rsqrt()  # not sqrt, for which torch starts threads
     return RigFrame(origin, length, total, middle, reach, posed, enough, broken == 0)
 
 
