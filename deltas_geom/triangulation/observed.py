@@ -91,7 +91,7 @@ def in_parts(
         end = start + few
         if parts and weights is None and mask is None:
             x, y, sound = clean_pixels(pixels[..., start:end, :])
-            if sound is None and parts[0].weights.squared.shape[-1] == 1:
+            if sound is None and parts[0].weights.sound.shape[-1] == 1:
                 parts.append(Observations(x, y, parts[0].weights))
                 continue
         parts.append(
