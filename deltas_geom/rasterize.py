@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.checks import batch_shape, check_bool, check_image_size, check_shapes
-from deltas_geom.numerics.arithmetic import promoted, without_autocast
+from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 from deltas_geom.records import Record
 
 
@@ -75,12 +75,11 @@ def rasterize_depth(
     check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
     pixels, depth, given = promoted(pixels, depth, given)
-    used = depth.isfinite() & (depth > 0) & given.isfinite() & (given > 0)
-    used = used & pixels.isfinite().all(dim=-1)
-    if mask is not None:
-        used = used & mask
     # Double where: what is not used must pass no gradient and no NaN.
-    pixels = torch.where(used[..., None], pixels.expand(*used.shape, 2), 0.0)
+    pixels, known = finite_or_zero(pixels)
+    used = (depth > 0) & (depth < torch.inf) & (given > 0) & (given < torch.inf)
+    used = only(used, mask, None if known is None else known[..., 0], other=False)
+    pixels = pixels.expand(*batch, *pixels.shape[-2:])
     depth = torch.where(used, depth, 0.0)
     shares, columns, rows = _footprint(pixels, splat)
     weight = torch.where(used, given, 0.0)[..., None] * shares

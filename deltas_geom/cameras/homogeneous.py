@@ -4,7 +4,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom.checks import check_shapes
-from deltas_geom.numerics.arithmetic import finite_or_zero, only, unless_all, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    finite_or_zero,
+    only,
+    surely_below,
+    unless_all,
+    without_autocast,
+)
 
 
 @without_autocast
@@ -45,8 +51,9 @@ def safe_sqrt(squared: Tensor) -> Tensor:
     """
     positive = unless_all(squared > 0)
     # Double where, as above.
+    safe = only(squared, positive, other=1.0)
     # Not sqrt, for which torch starts threads from 2048 numbers on.
-    return only(only(squared, positive, other=1.0).pow(0.5), positive)
+    return only(safe * safe.rsqrt(), positive)
 
 
 @without_autocast
@@ -63,6 +70,9 @@ def from_homogeneous(coordinates: Tensor) -> Tensor:
                 [0., 0.]])
     """
     check_shapes(coordinates=(coordinates, "+D"))
+    quotient = coordinates[..., :-1] / coordinates[..., -1:]
+    if surely_below(quotient):
+        return quotient
     known, _ = finite_or_zero(coordinates)
     last = known[..., -1:]
     return safe_divide(known[..., :-1], last, last != 0)

@@ -50,8 +50,8 @@ def camera_centers(cam_from_world: Tensor) -> Tensor:
     check_shapes(cam_from_world=(cam_from_world, "4 4"))
     known, finite = finite_or_zero(cam_from_world, dims=2)
     rotation, translation = known[..., :3, :].split_with_sizes([3, 1], dim=-1)
-    centers = -(rotation.mT @ translation)
-    return only(centers, finite, other=torch.nan).squeeze(-1)
+    centers = -(rotation * translation).sum(dim=-2, keepdim=True)
+    return only(centers, finite, other=torch.nan).squeeze(-2)
 
 
 def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:

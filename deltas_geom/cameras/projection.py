@@ -118,4 +118,4 @@ def rays_of_finite(K: Tensor, pixels: Tensor) -> Tensor:
     x, y = pixels.unbind(dim=-1)
     y = (y - cy) / fy
     x = (x - cx - skew * y) / fx
-    return with_one(torch.stack([x, y], dim=-1))
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)

@@ -228,27 +228,28 @@ def finite_views(
 def finite_intrinsics(K: Tensor) -> tuple[Tensor, Tensor | None]:
     """Intrinsics to divide by, an identity in place of what is no camera, and which are one."""
     plain = K.detach()
-    focal = plain.diagonal(dim1=-2, dim2=-1)[..., :2].prod(dim=-1)
-    if surely_below(plain) and bool(focal.all()):
+    focal, most = plain.diagonal(dim1=-2, dim2=-1), torch.finfo(K.dtype).max ** 0.25
+    # Then the product of two is not 0, either.
+    if surely_below(plain) and surely_below(focal.reciprocal(), most):
         return K, None
-    known = (plain.abs().amax(dim=(-2, -1), keepdim=True) < torch.inf) & (focal != 0)[
-        ..., None, None
-    ]
+    known = (plain.abs().amax(dim=(-2, -1)) < torch.inf) & (focal[..., 0] * focal[..., 1] != 0)
+    known = known[..., None, None]
     return torch.where(known, K, torch.eye(3, device=K.device, dtype=K.dtype)), known
 
 
 def _check_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:
     """``*B`` of K and ``poses``, whose name is ``name``; raise unless they go together."""
-    if isinstance(K, Tensor) and isinstance(poses, Tensor):
-        cameras = K.shape[-2:] == (3, 3) and poses.shape[-2:] == (4, 4) and poses.ndim > 2
-        if cameras and K.shape[-3:-2] != poses.shape[-3:-2]:
-            _refuse_one_for_all(K, poses, name)
+    tensors = isinstance(K, Tensor) and isinstance(poses, Tensor)
+    if tensors and K.shape[-3:-2] != poses.shape[-3:-2]:
+        _refuse_one_for_all(K, poses, name)
     check_shapes(**{"K": (K, "V 3 3"), name: (poses, "V 4 4")})
     return batch_shape(K.shape[:-3], poses.shape[:-3])
 
 
 def _refuse_one_for_all(K: Tensor, poses: Tensor, name: str) -> None:
     """Raise ``ShapeError`` with the cure where K seems to be one for all views."""
+    if K.shape[-2:] != (3, 3) or poses.shape[-2:] != (4, 4) or poses.ndim < 3:
+        return
     views = poses.shape[-3]
     if K.ndim == 2 or K.shape[-3] == 1:
         cure = f"K.expand{(*K.shape[:-3], views, 3, 3)}"

@@ -18,7 +18,6 @@ from deltas_geom.numerics.arithmetic import (
     numbers_or_zero,
     only,
     promoted,
-    surely_below,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -72,9 +71,9 @@ def sample_segments(
         foreshortening=(segments.foreshortening, "S N"),
     )
     *ends, low, high, _, ratio = segments
-    parts, sound = [*ends, *(each[..., None] for each in (low, high, ratio))], None
-    if not all(map(surely_below, parts)):
-        known, sound = finite_or_zero(torch.cat(parts, dim=-1))
+    parts = [*ends, *(each[..., None] for each in (low, high, ratio))]
+    known, sound = finite_or_zero(torch.cat(parts, dim=-1))
+    if sound is not None:
         parts = list(known.split_with_sizes([2, 2, 1, 1, 1], dim=-1))
     start, end, low, high, ratio = parts
     fraction = torch.linspace(0, 1, num_samples, device=start.device, dtype=start.dtype)

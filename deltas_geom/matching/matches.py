@@ -16,6 +16,7 @@ from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
     only,
+    surely_below,
     unless_all,
     without_autocast,
 )
@@ -108,8 +109,9 @@ def soft_argmax(
         near = torch.where((index - place[..., None]).abs() <= window, probability, 0.0)
     mass = near.sum(dim=-1)
     share = safe_divide(near, mass[..., None], (mass > 0)[..., None])
-    if possible is not None:
-        positions = only(positions, possible[..., None])  # far ones, to the square
+    far = torch.finfo(positions.dtype).max ** 0.25  # beyond, squares of what is not possible count
+    if possible is not None and not surely_below(positions, far):
+        positions = only(positions, possible[..., None])
     position = (share[..., None] * positions).sum(dim=-2)
     offset = positions - position.unsqueeze(-2)
     covariance = (share[..., None] * offset).mT @ offset
@@ -133,8 +135,9 @@ def matches_from_sources(
     batch = batch_shape(keypoints.shape[:-2], weights.shape[:-2])
     keypoints, known = finite_or_zero(keypoints)
     known = None if known is None else known.mT  # beside the sources, as the mask is
-    sources = (pixels, -3), (weights, -2), (covariance, -4), (mask, -2)
-    pixels, weights, covariance, mask = (x.expand(*batch, *x.shape[dims:]) for x, dims in sources)
+    if batch != weights.shape[:-2]:
+        sources = (pixels, -3), (weights, -2), (covariance, -4), (mask, -2)
+        pixels, weights, covariance, mask = (x.expand(*batch, *x.shape[d:]) for x, d in sources)
     anchor = keypoints.expand(*batch, *keypoints.shape[-2:]).unsqueeze(-3)
     ones = torch.ones_like(weights[..., :1, :])
     return Matches(
