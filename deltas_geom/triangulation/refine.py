@@ -12,14 +12,21 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
-from deltas_geom.checks import batch_shape, check_floating, check_shapes
+from deltas_geom.checks import batch_shape, check_floating, check_positive, check_shapes
 from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.symmetric3 import Symmetric3, solve3_scaled
+from deltas_geom.records import Record
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
-from deltas_geom.triangulation.observed import Observations, Vector3, cameras_of, observe
+from deltas_geom.triangulation.observed import (
+    Observations,
+    Vector3,
+    cameras_of,
+    homogeneous_in_views,
+    observe,
+)
 from deltas_geom.triangulation.robust_loss import Loss, robust_loss, second_derivative
 from deltas_geom.triangulation.weights import check_weights
 
@@ -29,7 +36,7 @@ _Descent = Callable[["_Problem", int], _End]
 _FARTHEST = 1e10  # px: a projection farther out than this is as good as behind the camera
 
 
-class Refined(NamedTuple):
+class Refined(Record):
     """Refined points.
 
     Attributes:
@@ -77,8 +84,7 @@ def refine_points(
         pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything.
         points: ``(*B, N, 3)`` in the world, metres: where to start. The (0, 0, 0) of a failed
             triangulation is a place like any other: only what was valid before still is.
-        weights: ``(*B, V, N)`` not negative (a sign has no effect). 0 = unused. Only their
-            ratios count.
+        weights: ``(*B, V, N)`` not negative (a sign has no effect). 0 = unused. Ratios count.
         mask: ``(*B, V, N)`` bool, True = used.
         steps: of Gauss-Newton. 0 judges the points without moving them.
         loss: "squared", "huber" (linear beyond ``scale``) or "cauchy" (logarithmic).
@@ -115,8 +121,7 @@ def refine_points(
         raise ValueError(f"gradient must be 'unrolled' or 'implicit', got {gradient!r}")
     if steps < 0:
         raise ValueError(f"steps must not be negative, got {steps}")
-    if not scale > 0:
-        raise ValueError(f"scale must be positive, got {scale}")
+    check_positive(scale=scale)
 
     def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:
         problem = _pose(partial(robust_loss, loss, scale), *inputs)
@@ -151,13 +156,12 @@ class _Problem(NamedTuple):
 
 def _pose(robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Any) -> _Problem:
     cameras = cameras_of(proj)
-    weights, mask = weighed
-    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
-    observed = observe(pixels, weights, mask, batch)
+    batch = check_weights(*weighed, "pixels", pixels, "V N 2", proj.shape[:-3])
+    observed = observe(pixels, *weighed, batch)
     place = points.mT.to(observed.x.dtype).contiguous()
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
-    start = torch.where(finite.unsqueeze(-2), place, place.new_zeros(()))
+    start = torch.where(finite.unsqueeze(-2), place, 0.0)
     # One broken view outweighs all that are used, so that one sum tells both.
     counted = observed.weights.used * (1 - proj.shape[-3] * cameras.broken).unsqueeze(-1)
     sound = observed.weights.sound & finite & (counted.sum(dim=-2) >= 2)
@@ -190,9 +194,7 @@ class _Fit(NamedTuple):
 
 def _fit(problem: _Problem, points: Vector3) -> _Fit:
     observed = problem.observed
-    rows = problem.proj.transpose(-3, -2).flatten(-3, -2)  # (*B, 3 V, 4)
-    homogeneous = rows @ torch.stack([*points, torch.ones_like(points[0])], dim=-2)
-    a, b, c = homogeneous.chunk(3, dim=-2)
+    a, b, c = homogeneous_in_views(problem.proj, (*points, torch.ones_like(points[0])))
     with torch.no_grad():
         # Far enough from overflow for squares of all that is divided by the depth.
         smallest = torch.finfo(c.dtype).tiny ** (1 / 6)

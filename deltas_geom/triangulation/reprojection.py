@@ -100,9 +100,13 @@ def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
         if not everywhere:
             apart = apart * (used[..., one, :] * used[..., rest, :])
         chord = torch.maximum(chord, apart.amax(dim=-2))
-    # The chord keeps small angles that the arc cosine of a dot product rounds away.
-    # Neither asin nor sqrt, for which torch starts threads from 2048 numbers on.
-    square = (0.25 * chord).clamp(min=tiny, max=1)
-    other = (1 - square).clamp(min=tiny)
-    angle = 2 * torch.atan2(square * square.rsqrt(), other * other.rsqrt())
-    return torch.where(chord > 0, angle, 0.0)
+    return angle_of(chord)
+
+
+def angle_of(chord: Tensor) -> Tensor:
+    """Angle, rad, between unit vectors whose squared difference this is.
+
+    It keeps small angles, which the arc cosine of a dot product rounds away.
+    """
+    square = (0.25 * chord).clamp(max=1)
+    return 2 * torch.atan2(safe_sqrt(square), safe_sqrt(1 - square))

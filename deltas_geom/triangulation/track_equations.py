@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import solver_dtype
-from deltas_geom.numerics.ldl import Symmetric4
-from deltas_geom.triangulation.observed import projection_centers
+from deltas_geom.numerics.ldl import Symmetric4, Vector4
+from deltas_geom.triangulation.observed import Vector3, projection_centers
 from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame
-from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
+from deltas_geom.triangulation.solution import in_world
+from deltas_geom.triangulation.weights import Weights, weigh_listed
 
 
 class Listed(NamedTuple):
@@ -19,27 +20,24 @@ class Listed(NamedTuple):
         camera: ``(3, 4, T)`` projection matrix.
         x: ``(T)`` px, 0 where not finite.
         y: ``(T)``.
-        squared: ``(T)`` squared weights, a point's largest 1; 0 where unused or not finite.
-        unused: ``(T)`` bool.
+        weights: of the pixels.
         point: ``(T)`` index.
-        sound: ``(N)`` bool: every used pixel and weight is finite.
     """
 
     camera: Tensor
     x: Tensor
     y: Tensor
-    squared: Tensor
-    unused: Tensor
+    weights: Weights
     point: Tensor
-    sound: Tensor
 
 
 class PosedTracks(NamedTuple):
-    """The points' equations, in their frames.
+    """The points' equations, in their frames: :class:`Linear`.
 
     Attributes:
         listed: the observations.
         rows: x p3 - p1 and y p3 - p2 in the frame, each four ``(T)``.
+        center: ``(3, T)`` of the cameras.
         datum: ``(1, 3)`` the origin of the sums, in the world.
         frame: of the points.
         normal: ten ``(N)``, in the frame.
@@ -48,10 +46,27 @@ class PosedTracks(NamedTuple):
 
     listed: Listed
     rows: tuple[Tensor, Tensor]
+    center: Tensor
     datum: Tensor
     frame: RigFrame
     normal: Symmetric4
     dtype: torch.dtype
+
+    def product(self, x: Vector4) -> Vector4:
+        """As of :class:`Linear`."""
+        a, b = self.rows
+        place = at(torch.stack(x), self.listed.point)
+        along_a, along_b = (a * place).sum(dim=0), (b * place).sum(dim=0)
+        rows = self.listed.weights.squared * (a * along_a + b * along_b)
+        g0, g1, g2, g3 = summed(rows, self.listed.point, len(x[0]))
+        return g0, g1, g2, g3
+
+    def in_front(self, points: Vector3) -> Tensor:
+        """As of :class:`Linear`."""
+        listed, place = self.listed, torch.stack(in_world(points, self.datum))
+        _, _, depth = project_listed(listed.camera, at(place, listed.point))
+        behind = torch.where(depth > 0, 0.0, listed.weights.used)
+        return summed(behind, listed.point, place.shape[-1]) == 0
 
 
 def pose_tracks(
@@ -81,22 +96,27 @@ def pose_tracks(
     centers = projection_centers(camera)
     # Of all cameras alike: those that see nothing do no harm beyond rounding.
     datum = centers.detach().mean(dim=0, keepdim=True)
-    weighted, counted = camera_moments(centers, datum, (~finite).to(work))
-    frame = rig_frame(
-        summed(at(weighted, camera_index) * listed.squared, point_index, num_points).unbind(),
-        summed(
-            torch.where(listed.unused, 0.0, at(counted, camera_index)), point_index, num_points
-        ).unbind(),
-        eps=torch.finfo(proj.dtype).eps,
+    sums = (
+        summed(at(moments, camera_index) * times, point_index, num_points).unbind()
+        for moments, times in zip(
+            camera_moments(centers, datum, (~finite).to(work)),
+            (listed.weights.squared, listed.weights.used),
+            strict=True,
+        )
     )
-    frame = frame._replace(finite=frame.finite & listed.sound)
+    frame = rig_frame(*sums, eps=torch.finfo(proj.dtype).eps)
+    frame = frame._replace(finite=frame.finite & listed.weights.sound)
     origin = at(torch.stack(frame.origin), point_index) + datum.mT
     unit = at(frame.unit, point_index)
     moved = ((listed.camera[:, :3] * origin).sum(dim=1) + listed.camera[:, 3]) / unit
     p1, p2, p3 = torch.cat([listed.camera[:, :3], moved[:, None]], dim=1)  # each (4, T)
     rows = listed.x * p3 - p1, listed.y * p3 - p2
-    normal = _normal_matrix(rows, listed.squared, point_index, num_points)
-    return PosedTracks(listed, rows, datum, frame, normal, proj.dtype)
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = summed_squares(
+        *rows, listed.weights.squared, point_index, num_points
+    )
+    normal = m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+    center = at(centers.mT, camera_index)
+    return PosedTracks(listed, rows, center, datum, frame, normal, proj.dtype)
 
 
 def _listed(
@@ -108,52 +128,33 @@ def _listed(
     weights: Tensor,
 ) -> Listed:
     x, y = pixels.to(camera.dtype).unbind(dim=-1)
-    weight = weights.to(camera.dtype)
     with torch.no_grad():
-        size = weight.abs()
         # What is beyond overflows; NaN is not below.
-        sound = (x * x + y * y < torch.finfo(x.dtype).max ** 0.25) & (
-            size <= torch.finfo(x.dtype).max
-        )
-        # NaN counts as used.
-        largest = at(_largest(size.nan_to_num(0.0), point_index, num_points), point_index)
-        unused = size <= NEGLIGIBLE_WEIGHT * largest
-        wrong = summed((~(sound | unused)).to(x.dtype), point_index, num_points)
-        largest = torch.where((largest > 0) & largest.isfinite(), largest, 1.0)
+        sound = x * x + y * y < torch.finfo(x.dtype).max ** 0.25
     # Double where: what is not used must pass no gradient and no NaN.
-    share = torch.where(sound, weight, 0.0) / largest
     return Listed(
         camera=at(camera.permute(1, 2, 0), camera_index),
         x=torch.where(sound, x, 0.0),
         y=torch.where(sound, y, 0.0),
-        squared=torch.where(unused, 0.0, share * share),
-        unused=unused,
+        weights=weigh_listed(weights.to(x.dtype), point_index, num_points, sound=sound),
         point=point_index,
-        sound=wrong == 0,
     )
 
 
-def _normal_matrix(
-    rows: tuple[Tensor, Tensor], squared: Tensor, point: Tensor, count: int
-) -> Symmetric4:
-    """A^T W^2 A as ten ``(N)``."""
-    a, b = rows
-    wa, wb = squared * a, squared * b
-    entries = torch.stack(
-        [torch.addcmul(wa[i] * a[j], wb[i], b[j]) for i in range(4) for j in range(i, 4)]
-    )
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = summed(entries, point, count).unbind(dim=0)
-    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+def summed_squares(
+    a: Tensor, b: Tensor, squared: Tensor, point: Tensor, count: int
+) -> tuple[Tensor, ...]:
+    """Sums of w^2 (a a^T + b b^T) of vectors ``(K, T)``, upper triangle: K (K + 1) / 2 ``(N)``."""
+    wa, wb, size = squared * a, squared * b, len(a)
+    entries = [
+        torch.addcmul(wa[i] * a[j], wb[i], b[j]) for i in range(size) for j in range(i, size)
+    ]
+    return summed(torch.stack(entries), point, count).unbind(dim=0)
 
 
 def summed(values: Tensor, index: Tensor, count: int) -> Tensor:
     """Sums ``(*K, N)`` over observations ``(*K, T)`` of each point."""
     return values.new_zeros(*values.shape[:-1], count).index_add(-1, index, values)
-
-
-def _largest(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Largest of non-negative ``(T)`` over each point's observations, ``(N)``; 0 if none."""
-    return values.new_zeros(count).scatter_reduce(0, index, values, "amax")
 
 
 def at(values: Tensor, index: Tensor) -> Tensor:

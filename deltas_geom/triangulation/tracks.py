@@ -4,7 +4,7 @@ What :func:`triangulate` does over a dense V x N, here as one list of observatio
 into its point's normal matrix. Memory grows with the observations alone.
 """
 
-from typing import NamedTuple
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,17 +12,17 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import ShapeError, check_floating, check_index, check_shapes
 from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.evaluation import recomputed
-from deltas_geom.numerics.ldl import Vector4
+from deltas_geom.records import Record
 from deltas_geom.status import Status
-from deltas_geom.triangulation.judge import judge, ok
-from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.triangulation.operation import operation
+from deltas_geom.triangulation.reprojection import angle_of, projected, squared_errors
+from deltas_geom.triangulation.results import beyond, refused_by_residual, without
 from deltas_geom.triangulation.solution import (
-    FoundPoints,
-    derivable_points,
-    find_points,
+    Solution,
+    follow_linear,
     in_world,
     kept,
+    solve_linear,
 )
 from deltas_geom.triangulation.track_equations import (
     PosedTracks,
@@ -30,10 +30,12 @@ from deltas_geom.triangulation.track_equations import (
     pose_tracks,
     project_listed,
     summed,
+    summed_squares,
 )
+from deltas_geom.triangulation.uncertainty import inverse_information, unscaled
 
 
-class TriangulatedTracks(NamedTuple):
+class TriangulatedTracks(Record):
     """Triangulated points and what is known about them.
 
     Attributes:
@@ -43,6 +45,15 @@ class TriangulatedTracks(NamedTuple):
         status: ``(N)`` int8 of :class:`Status`.
         valid: ``(N)`` bool, status is OK.
         residual: ``(N)`` weighted RMS distance of the projections from the pixels, px.
+        errors: ``(T)`` distance of each used observation's projection from its pixel, px; 0 where
+            unused or the point is not valid.
+        parallax: ``(N)`` angle between the rays of two used observations that are far apart, rad,
+            of the largest at least half; the largest itself where there are up to three, and mostly
+            where there are more. Its cost is that of the list, not of pairs.
+        covariance: ``(N, 3, 3)`` for pixel noise of standard deviation 1 / weight px, m^2; None
+            unless asked for; 0 if not valid.
+        point_index: ``(T)`` of the observations, as given.
+        used: ``(T)`` bool: the observation's weight counts.
     """
 
     points: Tensor
@@ -50,6 +61,21 @@ class TriangulatedTracks(NamedTuple):
     status: Tensor
     valid: Tensor
     residual: Tensor
+    errors: Tensor
+    parallax: Tensor
+    covariance: Tensor | None
+    point_index: Tensor
+    used: Tensor
+
+    def within_residual(self, max_residual: float) -> "TriangulatedTracks":
+        """As :meth:`Triangulation.within_residual`; px."""
+        return refused_by_residual(self, max_residual, self.point_index)
+
+    def within_depth(self, depth_range: tuple[float, float]) -> "TriangulatedTracks":
+        """As :meth:`Triangulation.within_depth`, the range being that of all used observations."""
+        outside = (beyond(self.depth, depth_range) & self.used).to(self.depth.dtype)
+        outside = summed(outside, self.point_index, len(self.valid)) > 0
+        return without(self, outside, Status.OUT_OF_RANGE, self.point_index)
 
 
 @without_autocast
@@ -60,6 +86,9 @@ def triangulate_tracks(
     point_index: Tensor,
     num_points: int,
     weights: Tensor | None = None,
+    *,
+    covariance: bool = False,
+    max_residual: float | None = None,
 ) -> TriangulatedTracks:
     """Triangulate N points from T observations by C cameras, differentiably.
 
@@ -73,6 +102,9 @@ def triangulate_tracks(
         point_index: ``(T)`` integers, 0 to N - 1.
         num_points: N. A point without observations has the status TOO_FEW_VIEWS.
         weights: ``(T)`` not negative (a sign has no effect). 0 = unused.
+        covariance: also compute the covariance of the points.
+        max_residual: px; points about which the cameras disagree by more are RESIDUAL_TOO_LARGE.
+            Indices of cameras and points that were swapped have residuals of many pixels, too.
 
     Returns:
         Points with status. Nothing raises or turns NaN because of pixels, weights or cameras.
@@ -80,7 +112,7 @@ def triangulate_tracks(
     Raises:
         ShapeError: a shape differs.
         TypeError: an index is not of integers.
-        ValueError: ``num_points`` is negative.
+        ValueError: ``num_points`` is negative, or ``max_residual`` not positive.
         IndexError or RuntimeError: by torch, an index is out of range. (On a GPU torch may tell
             later, or end the process: check lists of unknown origin before they go there.)
 
@@ -127,69 +159,73 @@ def triangulate_tracks(
     if num_points < 0:
         raise ValueError(f"num_points must not be negative, got {num_points}")
 
-    def known(posed: PosedTracks, points: Vector3, status: Tensor) -> tuple[Tensor, ...]:
-        listed, valid = posed.listed, status == Status.OK.value
-        ok = at(valid, listed.point)
-        x, y, depth = project_listed(listed.camera, at(torch.stack(points), listed.point))
-        counts = ~listed.unused & ok
-        dx = safe_divide(x, depth, counts) - torch.where(counts, listed.x, 0.0)
-        dy = safe_divide(y, depth, counts) - torch.where(counts, listed.y, 0.0)
-        squared = torch.where(counts, listed.squared, 0.0)
-        errors = summed(squared * (dx * dx + dy * dy), listed.point, num_points)
-        total = summed(squared, listed.point, num_points)
-        mean = safe_divide(errors, total, total > 0)
-        residual = safe_sqrt(mean)
-        limit = torch.finfo(proj.dtype).max
-        outward = (
-            found.to(proj.dtype).clamp(-limit, limit)
-            for found in (torch.stack(points, dim=-1), torch.where(ok, depth, 0.0), residual)
+    return operation(
+        TriangulatedTracks,
+        (proj, pixels, camera_index.long(), point_index.long(), weight),
+        see=partial(pose_tracks, num_points=num_points),
+        solve=solve_linear,
+        follow=follow_linear,
+        describe=_describe,
+        dtype=proj.dtype,
+        covariance=covariance,
+        max_residual=max_residual,
+        listed=True,
+    )
+
+
+def _describe(
+    posed: PosedTracks, found: Solution, valid: Tensor, covariance: bool
+) -> dict[str, Tensor]:
+    (camera, px, py, weights, point), count = posed.listed, len(valid)
+    place = torch.stack(kept(in_world(found.points, posed.datum), valid))
+    both, each = at(valid, point), at(place, point)
+    used = ~weights.unused & both
+    x, y, depth = project_listed(camera, each)
+    seen = projected(x, y, depth, used)
+    squared = torch.where(seen.seen, weights.squared, 0.0)
+    errors = squared_errors(seen, px, py)
+    total = summed(squared, point, count)
+    mean = safe_divide(summed(squared * errors, point, count), total, total > 0)
+    fields = {
+        "points": place.mT,
+        "depth": torch.where(both, depth, 0.0),
+        "residual": safe_sqrt(mean),
+        "errors": safe_sqrt(errors),
+        "parallax": _parallax(each - posed.center, used, point, count),
+        "point_index": point,
+        "used": ~weights.unused & at(weights.sound, point),
+    }
+    if covariance:
+        # The derivative of a pixel by the point is its equations, divided by the depth.
+        across, down = (
+            seen.x * camera[2, :3] - camera[0, :3],
+            seen.y * camera[2, :3] - camera[1, :3],
         )
-        return (*outward, status)
-
-    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
-        posed = pose_tracks(*inputs, num_points=num_points)
-        found, status = _find(posed)
-        points = kept(in_world(found.points, posed.datum), ok(status))
-        return known(posed, points, status)
-
-    def derivable(*inputs: Tensor) -> tuple[Tensor, ...]:
-        posed = pose_tracks(*inputs, num_points=num_points)
-        found, status = _find(posed)
-        valid = status == Status.OK.value
-        near = derivable_points(posed.normal, posed.frame, found.vector, valid)
-        return known(posed, kept(in_world(near, posed.datum), valid), status)
-
-    inputs = (proj, pixels, camera_index.long(), point_index.long(), weight)
-    points, depth, residual, status = recomputed(derivable, *inputs, values=values)
-    return TriangulatedTracks(points, depth, status, status == Status.OK.value, residual)
+        by_depth = squared * seen.inverse * seen.inverse
+        information = summed_squares(across, down, by_depth, point, count)
+        enough = summed(seen.seen.to(x.dtype), point, count) >= 2
+        fields["covariance"] = unscaled(inverse_information(information, enough), weights.largest)
+    return fields
 
 
 @torch.no_grad()
-def _find(posed: PosedTracks) -> tuple[FoundPoints, Tensor]:
-    """Points and their status, without gradient."""
-    listed, count = posed.listed, posed.frame.unit.shape[0]
+def _parallax(rays: Tensor, used: Tensor, point: Tensor, count: int) -> Tensor:
+    """Angles ``(N)`` between the used of rays ``(3, T)``: of one far from their middle, to another.
 
-    def product(x: Vector4) -> Vector4:
-        a, b = posed.rows
-        place = at(torch.stack(x), listed.point)
-        along_a, along_b = (a * place).sum(dim=0), (b * place).sum(dim=0)
-        rows = listed.squared * (a * along_a + b * along_b)
-        g0, g1, g2, g3 = summed(rows, listed.point, count)
-        return g0, g1, g2, g3
-
-    polish = 2 if posed.dtype == torch.float64 else 0
-    eps = torch.finfo(posed.dtype).eps
-    found = find_points(posed.normal, posed.frame, eps=eps, product=product, polish=polish)
-    x, y, z = in_world(found.points, posed.datum)
-    _, _, depth = project_listed(listed.camera, at(torch.stack([x, y, z]), listed.point))
-    behind = summed((~listed.unused & ~(depth > 0)).to(depth.dtype), listed.point, count)
-    held = x.abs() + y.abs() + z.abs() <= torch.finfo(posed.dtype).max
-    frame = posed.frame
-    status = judge(
-        finite=frame.finite,
-        enough=frame.enough,
-        posed=found.posed,
-        near=found.near & held,
-        in_front=behind == 0,
-    )
-    return found, status
+    Of rays of unit length on a sphere, so that a chord stands for an angle. Who is farthest from
+    the middle is at least half of the largest chord away from someone; who is farthest from that
+    one, again and again, never comes nearer.
+    """
+    if len(point) == 0:
+        return rays.new_zeros(count)
+    tiny = torch.finfo(rays.dtype).tiny ** 0.5
+    rays = rays * rays.square().sum(dim=0).clamp(min=tiny).rsqrt()
+    number = torch.arange(len(point), device=point.device)
+    counts = used.to(rays.dtype)
+    middle = summed(rays * counts, point, count) / summed(counts, point, count).clamp(min=1)
+    for _ in range(4):
+        chord = torch.where(used, (rays - at(middle, point)).square().sum(dim=0), -1.0)
+        largest = chord.new_zeros(count).scatter_reduce(0, point, chord, "amax")
+        farthest = torch.where(used & (chord == at(largest, point)), number, 0)
+        middle = at(rays, farthest.new_zeros(count).scatter_reduce(0, point, farthest, "amax"))
+    return angle_of(largest)

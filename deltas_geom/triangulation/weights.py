@@ -65,23 +65,45 @@ def weigh(
         none = torch.zeros_like(one, dtype=torch.bool)
         share = one if alike else weight / largest
         return Weights(share * share, largest, none, one, ~none[..., 0, :])
-    unused = size <= NEGLIGIBLE_WEIGHT * largest
-    counted = largest <= torch.finfo(work).max  # NaN is not, either
-    largest = torch.where(counted & (largest > 0), largest, 1.0)
-    # Double where: an infinite weight must not turn the gradient into NaN.
-    share = torch.where(counted, weight, 0.0) / largest
-    if sound is None:
-        sound = torch.ones_like(unused)
     # What is not sound makes its point fail, if it is used: it need not be told from point to
     # point where all are alike.
-    counts = ~unused if alike else sound & ~unused
-    return Weights(
-        squared=torch.where(counts, share * share, 0.0),
-        largest=largest,
-        unused=unused,
-        used=(~unused).to(work),
-        sound=(sound | unused).all(dim=-2) & counted.squeeze(-2),
-    )
+    squared, largest, unused, counted = _shares(weight, largest, None if alike else sound)
+    known = counted if sound is None else (sound | unused) & counted
+    return Weights(squared, largest, unused, (~unused).to(work), known.all(dim=-2))
+
+
+def weigh_listed(weights: Tensor, point: Tensor, count: int, *, sound: Tensor) -> Weights:
+    """The same of a list of observations, all fields ``(T)`` but ``sound`` and ``largest`` ``(N)``.
+
+    Args:
+        weights: ``(T)``, in the solver's type.
+        point: ``(T)`` index of each observation's point.
+        count: N.
+        sound: ``(T)`` bool.
+    """
+    size = weights.detach().abs()
+    sound = sound & (size <= torch.finfo(size.dtype).max)  # NaN is not
+    largest = size.new_zeros(count).scatter_reduce(0, point, size.nan_to_num(0.0), "amax")
+    squared, _, unused, _ = _shares(weights, largest.index_select(0, point), sound)
+    wrong = size.new_zeros(count).index_add(0, point, (~(sound | unused)).to(size.dtype))
+    largest = torch.where(largest > 0, largest, 1.0)
+    return Weights(squared, largest, unused, (~unused).to(size.dtype), wrong == 0)
+
+
+def _shares(
+    weight: Tensor, largest: Tensor, sound: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Squared shares of the largest, 0 unless used and sound; the largest, or 1 if that is no
+    number to divide by; what is unused; is the largest finite?
+    """
+    unused = weight.detach().abs() <= NEGLIGIBLE_WEIGHT * largest
+    counted = largest <= torch.finfo(largest.dtype).max  # NaN is not, either
+    largest = torch.where(counted & (largest > 0), largest, 1.0)
+    # Double where: an infinite weight must not turn the gradient into NaN.
+    kept = counted if sound is None else counted & sound
+    share = torch.where(kept, weight, 0.0) / largest
+    counts = ~unused if sound is None else sound & ~unused
+    return torch.where(counts, share * share, 0.0), largest, unused, counted
 
 
 def _all_count(size: Tensor, largest: Tensor) -> bool:
