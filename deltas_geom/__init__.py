@@ -33,6 +33,7 @@ from deltas_geom.matching.matches import (
 from deltas_geom.modules import DepthRasterizer, EpipolarSampler, Triangulator
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
 from deltas_geom.status import Status
+from deltas_geom.triangulation.aimed import ray_covariance, refine_rays, triangulate_robust_rays
 from deltas_geom.triangulation.midpoint import (
     triangulate_inverse_depth_weighted,
     triangulate_midpoint,
@@ -93,8 +94,10 @@ __all__ = [
     "point_covariance",
     "project",
     "rasterize_depth",
+    "ray_covariance",
     "ray_parallax",
     "refine_points",
+    "refine_rays",
     "relative_pose",
     "reprojection_residual",
     "resize_intrinsics",
@@ -110,6 +113,7 @@ __all__ = [
     "triangulate_points",
     "triangulate_rays",
     "triangulate_robust",
+    "triangulate_robust_rays",
     "triangulate_tracks",
     "triangulate_two_view",
     "unproject",

@@ -28,6 +28,7 @@ class Bearings(NamedTuple):
         datum: ``(*B, 1, 3)`` a place near the cameras, from which points are counted.
         broken: ``(*B, V)`` 1 for cameras that are not finite, else 0.
         directions: three ``(*B, V, N)`` unit, in the world; any where unsound.
+        sound: ``(*B, V, N)`` bool: the ray and its camera are finite, and it has a direction.
         weights: of the rays.
         dtype: of the inputs.
     """
@@ -36,6 +37,7 @@ class Bearings(NamedTuple):
     datum: Tensor
     broken: Tensor
     directions: Vector3
+    sound: Tensor
     weights: Weights
     dtype: torch.dtype
 
@@ -93,7 +95,8 @@ def see_rays(
     centers = -(pose[..., :3] * pose[..., 3:]).sum(dim=-2)
     weighed = weigh(weights, mask, batch=batch, like=rays, sound=None if every else sound)
     directions = (x * inverse, y * inverse, z * inverse)
-    return Bearings(centers, datum_of(centers), (~posed).to(work), directions, weighed, rays.dtype)
+    broken, datum = (~posed).to(work), datum_of(centers)
+    return Bearings(centers, datum, broken, directions, sound, weighed, rays.dtype)
 
 
 def describe_rays(
@@ -103,10 +106,7 @@ def describe_rays(
     points, weights, both = kept(points, valid), seen.weights, valid.unsqueeze(-2)
     used = ~weights.unused & both
     offset = seen.offsets(points)
-    along = dot(seen.directions, offset)
-    # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
-    sine = safe_sqrt(torch.where(used, squared_length(across(seen.directions, offset)), 0.0))
-    angle = torch.atan2(sine, torch.where(used, along, 1.0))
+    along, angle = angles_of(seen, offset, used)
     place = kept(in_world(points, seen.datum), valid)
     found = {
         "points": torch.stack(place, dim=-1),
@@ -126,6 +126,14 @@ def describe_rays(
         inverse = inverse_information((xx, xy, xz, yy, yz, zz), used.sum(dim=-2) >= 2)
         found["covariance"] = unscaled(inverse, weights.largest.squeeze(-2))
     return found
+
+
+def angles_of(seen: Bearings, offset: Vector3, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Lengths along the rays of :meth:`Bearings.offsets`, m; angles from the used ones, rad."""
+    along = dot(seen.directions, offset)
+    # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
+    sine = safe_sqrt(torch.where(used, squared_length(across(seen.directions, offset)), 0.0))
+    return along, torch.atan2(sine, torch.where(used, along, 1.0))
 
 
 def dot(a: Vector3, b: Vector3) -> Tensor:

@@ -156,8 +156,8 @@ class _Problem(NamedTuple):
 
 def _pose(robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Any) -> _Problem:
     cameras = cameras_of(proj)
-    batch = check_weights(*weighed, "pixels", pixels, "V N 2", proj.shape[:-3])
-    observed = observe(pixels, *weighed, batch)
+    batch = check_weights(weighed[0], weighed[1], "pixels", pixels, "V N 2", proj.shape[:-3])
+    observed = observe(pixels, weighed[0], weighed[1], batch)
     place = points.mT.to(observed.x.dtype).contiguous()
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
