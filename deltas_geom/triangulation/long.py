@@ -14,7 +14,6 @@ from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.numerics.ldl import Vector4
 from deltas_geom.triangulation.adjoint import gradients_of
 from deltas_geom.triangulation.equations import (
-    Alike,
     Equations,
     Frame,
     Rig,
@@ -57,30 +56,22 @@ class Solved(NamedTuple):
     status: Tensor
 
 
-class LongWay(NamedTuple):
+class LongWay:
     """Triangulation of pixels whose shapes have been checked.
 
-    Attributes:
+    Args:
         rig: of the cameras.
         batch: of all inputs together.
         frame: in which points are solved.
         dtype: of the results.
-        alike: what all points share, where they have neither weights nor a mask.
+        alike: are there neither weights nor a mask, so that all points share a frame?
     """
 
-    rig: Rig
-    batch: torch.Size
-    frame: Frame
-    dtype: torch.dtype
-    alike: Alike | None
-
-    @classmethod
-    def of(
-        cls, rig: Rig, batch: torch.Size, frame: Frame, dtype: torch.dtype, *, alike: bool
-    ) -> "LongWay":
-        """The way for cameras; ``alike`` if there are neither weights nor a mask."""
-        shared = alike_of(rig, frame, torch.finfo(dtype).eps) if alike else None
-        return cls(rig, batch, frame, dtype, shared)
+    def __init__(
+        self, rig: Rig, batch: torch.Size, frame: Frame, dtype: torch.dtype, *, alike: bool
+    ) -> None:
+        self.rig, self.batch, self.frame, self.dtype = rig, batch, frame, dtype
+        self.alike = alike_of(rig, frame, torch.finfo(dtype).eps) if alike else None
 
     def solved(
         self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
@@ -110,10 +101,12 @@ class LongWay(NamedTuple):
         eps = torch.finfo(self.dtype).eps
         return equations_of(self.rig, parts, frame=self.frame, eps=eps, alike=self.alike)
 
-    @torch.no_grad()
     def solve(self, equations: Equations) -> Solved:
-        """The points that minimise the algebraic error, and their status."""
+        """The points that minimise the algebraic error, and their status, without gradient."""
+        with torch.no_grad():
+            return self._solve(equations)
 
+    def _solve(self, equations: Equations) -> Solved:
         def product(x: Vector4) -> Vector4:
             return product_of(equations, x)
 

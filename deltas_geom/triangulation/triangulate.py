@@ -165,7 +165,7 @@ class Call:
 
     def long(self, rig: Rig) -> LongWay:
         """The long way by these cameras."""
-        return LongWay.of(rig, self.batch, self.frame, self.dtype, alike=self.alike)
+        return LongWay(rig, self.batch, self.frame, self.dtype, alike=self.alike)
 
     def solved(self) -> tuple[Tensor, Tensor]:
         """Points ``(*B, N, 3)`` in the solver's type and their status, without gradient."""
