@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_bool, check_floating, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
 from deltas_geom.epipolar.fundamental import cross_matrix
 from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
 from deltas_geom.numerics.sums import product
@@ -112,6 +112,7 @@ def triangulate_two_view(
     if mask is not None:
         check_shapes(pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
         check_bool(mask=mask)
+    batch_shape(*(t.shape[:-3] for t in (proj, pixels)), () if mask is None else mask.shape[:-2])
     return operation(
         TwoViewTriangulation,
         (proj, pixels, mask),
