@@ -13,6 +13,7 @@ from deltas_geom.numerics.sums import product
 from deltas_geom.status import Status
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.observed import check_observed
+from deltas_geom.triangulation.pairs import pairs_of, points_of_pairs
 from deltas_geom.triangulation.results import RobustTriangulation
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
 from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT, check_weights
@@ -210,11 +211,13 @@ def _consensus(
     points, status = solved(observed.usable)
     used, again = observed.usable, status
     best = judged(points, ok(status).unsqueeze(-2))
-    pairs = _pairs(observed.usable, max_pairs)
+    pairs = pairs_of(observed.usable, max_pairs)
     at_once = max(1, _BUDGET // max(1, observed.usable.numel()))
     for start in range(0, pairs[0].shape[-2], at_once):
         some = (tensor[..., start : start + at_once, :] for tensor in pairs)
-        best = best.or_cheaper(judged(*_pair_points(observed, *some)))
+        best = best.or_cheaper(
+            judged(*points_of_pairs(observed.centers, observed.directions, *some))
+        )
     agree = best.inliers
     for _ in range(_ROUNDS):
         # The better point finds inliers that a pair's noise had hidden, or loses some.
@@ -264,53 +267,3 @@ def _judge(
     cheapest, index = torch.where(possible, cost, torch.inf).min(dim=-2, keepdim=True)
     inliers = torch.take_along_dim(agree, index.unsqueeze(-3), dim=-2).squeeze(-2)
     return _Best(inliers & cheapest.isfinite(), cheapest.squeeze(-2))
-
-
-def _pairs(usable: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of usable views of each point: first, second and whether it exists, ``(*B, C, N)``.
-
-    Views on a circle: pairs half of it apart come first, neighbours last, each pair once.
-    """
-    count = min(most, usable.shape[-2] * (usable.shape[-2] - 1) // 2)
-    order = (~usable).to(torch.int8).argsort(dim=-2, stable=True)  # usable views first
-    around = usable.sum(dim=-2, keepdim=True).clamp(min=1)
-    pair = torch.arange(count, device=usable.device)[:, None]
-    # More views than pairs: start at views all over the circle rather than at the first.
-    first = torch.where(around > count, pair * around // max(1, count), pair % around)
-    apart = (around - 1) // 2 - pair // around
-    # Of an even number of views, the diameters are the half round that is left at the end.
-    apart = torch.where(apart > 0, apart, around // 2)
-    second = (first + apart) % around
-    exist = pair < around * (around - 1) // 2
-    return order.gather(-2, first), order.gather(-2, second), exist
-
-
-def _pair_points(
-    observed: _Observations, first: Tensor, second: Tensor, exist: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Points ``(*B, 3, C, N)`` of pairs of views, and whether they exist ``(*B, C, N)``.
-
-    Where the rays are closest to each other, the point between them at which both views are off
-    by about as many pixels.
-    """
-    centers = observed.centers.mT.unsqueeze(-1).expand_as(observed.directions)
-
-    def of(values: Tensor, view: Tensor) -> Tensor:
-        return torch.take_along_dim(values, view.unsqueeze(-3), dim=-2)
-
-    def dot(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum(dim=-3)
-
-    one, other = of(observed.directions, first), of(observed.directions, second)
-    start, end = of(centers, first), of(centers, second)
-    apart = end - start
-    a, b, c = dot(one, one), dot(one, other), dot(other, other)
-    p, q = dot(apart, one), dot(apart, other)
-    crossing = a * c > b * b
-    sine = torch.where(crossing, a * c - b * b, 1.0)
-    near, far = (c * p - b * q) / sine, (b * p - a * q) / sine
-    # An offset at depth z moves the pixel by 1 / z: the nearer view has more to say.
-    share = near.square() / (near.square() + far.square())
-    on_one, on_other = start + near.unsqueeze(-3) * one, end + far.unsqueeze(-3) * other
-    points = on_one + share.unsqueeze(-3) * (on_other - on_one)
-    return points, exist & crossing
