@@ -108,12 +108,15 @@ def tracks(proj: Tensor, pixels: Tensor, weights: Tensor) -> Any:
         numbers.expand(size, views, num).flatten(),
         size * num,
         weights.expand(*batch, views, num).reshape(size * views * num),
+        covariance=True,
     )
-    rows = (len(field) // max(size, 1) for field in found)
-    return tuple(
-        field.reshape(*batch, count, *field.shape[1:])
-        for field, count in zip(found, rows, strict=True)
-    )
+    seen = ("depth", "errors", "used")
+    by_item = {
+        name: field.reshape(*batch, *((views,) * (name in seen)), num, *field.shape[1:])
+        for name, field in found._replace(point_index=None)._asdict().items()
+        if field is not None
+    }
+    return geom.TriangulatedTracks(**by_item, point_index=None)
 
 
 def refined(
@@ -175,10 +178,14 @@ OPERATIONS: dict[str, Operation] = {
     "project": lambda K, poses, points: geom.project(PosedViews(K, poses), points),
     "rasterize_depth": rasterized,
     "rasterize_depth, mean": partial(rasterized, reduce="mean", splat="bilinear"),
+    "ray_covariance": lambda poses, points, weights: geom.ray_covariance(poses, points, weights),
     "ray_parallax": lambda proj, points, mask: geom.ray_parallax(proj, points, mask),
     "refine_points": refined,
-    "refine_points, huber": partial(refined, loss="huber"),
-    "refine_points, implicit": partial(refined, loss="cauchy", gradient="implicit"),
+    "refine_points, huber": partial(refined, loss="huber", scale=0.3),
+    "refine_points, implicit": partial(refined, loss="cauchy", scale=0.3, gradient="implicit"),
+    "refine_rays": lambda poses, rays, points, weights, mask: geom.refine_rays(
+        poses, rays, points, weights, mask, steps=2
+    ),
     "relative_pose": lambda pose, other_pose: geom.relative_pose(pose, other_pose),
     "reprojection_residual": lambda proj, points, pixels, weights: geom.reprojection_residual(
         proj, points, pixels, weights
@@ -201,24 +208,27 @@ OPERATIONS: dict[str, Operation] = {
         proj, pixels, weights, frame="world", covariance=True
     ),
     "triangulate_inverse_depth_weighted": lambda poses, rays, weights, mask: (
-        geom.triangulate_inverse_depth_weighted(poses, rays, weights, mask)
+        geom.triangulate_inverse_depth_weighted(poses, rays, weights, mask, covariance=True)
     ),
     "triangulate_midpoint": lambda poses, rays, weights, mask: geom.triangulate_midpoint(
-        poses, rays, weights, mask
+        poses, rays, weights, mask, covariance=True
     ),
     "triangulate_points": lambda proj, pixels: geom.triangulate_points(proj, pixels),
     "triangulate_points, weights": lambda proj, pixels, weights, mask: geom.triangulate_points(
         proj, pixels, weights, mask
     ),
     "triangulate_rays": lambda poses, rays, weights, mask: geom.triangulate_rays(
-        poses, rays, weights, mask
+        poses, rays, weights, mask, covariance=True
     ),
     "triangulate_robust": lambda proj, pixels, weights, mask: geom.triangulate_robust(
         proj, pixels, weights, mask, covariance=True
     ),
+    "triangulate_robust_rays": lambda poses, rays, weights, mask: geom.triangulate_robust_rays(
+        poses, rays, weights, mask, covariance=True
+    ),
     "triangulate_tracks": tracks,
     "triangulate_two_view": lambda proj, pixels, mask: geom.triangulate_two_view(
-        proj[..., :2, :, :], pixels[..., :2, :, :], mask[..., :2, :]
+        proj[..., :2, :, :], pixels[..., :2, :, :], mask[..., :2, :], covariance=True
     ),
     "unproject": lambda K, poses, pixels, depth: geom.unproject(
         PosedViews(K, poses), pixels, depth
@@ -257,7 +267,13 @@ RECORDS: dict[str, Operation] = {
     "SoftArgmax": OPERATIONS["soft_argmax"],
     "SparseDepth": rasterized,
     "TriangulatedTracks": lambda proj, keypoints, own_weights: geom.triangulate_tracks(
-        proj[:2], keypoints, torch.arange(6) % 2, torch.arange(6) // 2, 3, own_weights
+        proj[:2],
+        keypoints,
+        torch.arange(6) % 2,
+        torch.arange(6) // 2,
+        3,
+        own_weights,
+        covariance=True,
     ),
     "Triangulation": OPERATIONS["triangulate"],
     "TwoViewTriangulation": OPERATIONS["triangulate_two_view"],

@@ -4,11 +4,13 @@ The oracle minimises the same algebraic error of the same rounded inputs, so tha
 the solver's own error. An SVD of the rows, in the inputs' type, is the measure.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import mpmath
 import pytest
 import torch
+from solvers import WAYS, by
 from torch import Tensor
 
 from deltas_geom import refine_points, reprojection_residual, triangulate, triangulate_points
@@ -167,21 +169,49 @@ def error(found: mpmath.matrix, wanted: mpmath.matrix, case: Case) -> float:
     return float(max(abs(found[i] - wanted[i]) for i in range(3)) / (DEPTH * case.unit))
 
 
+class Oracle(NamedTuple):
+    """What others find in a case, by frame.
+
+    Attributes:
+        exact: the minimisers in 60 digits.
+        by_svd: torch's of rows in the inputs' type, in frames that are exact.
+    """
+
+    exact: dict[str, list[mpmath.matrix]]
+    by_svd: dict[str, list[mpmath.matrix]]
+
+
+@cache
+def oracle(name: str, views: int, dtype: torch.dtype) -> Oracle:
+    """Of a hard case."""
+    case = hard(name, views, dtype)
+    frames = {frame: exact_frames(case, frame) for frame in ("rig", "world")}
+    return Oracle(
+        {frame: exact_points(case, some) for frame, some in frames.items()},
+        {frame: svd_points(case, some) for frame, some in frames.items()},
+    )
+
+
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("frame", ["rig", "world"])
 @pytest.mark.parametrize("views", [2, 5])
 @pytest.mark.parametrize("name", CASES)
 def test_points_are_as_exact_as_an_svd_makes_them(
-    name: str, views: int, frame: str, dtype: torch.dtype
+    name: str, views: int, frame: str, way: str, dtype: torch.dtype
 ) -> None:
     if name == "ring" and views == 2:
         pytest.skip("two cameras that face each other see no depth")
+    lost = "weights" in name or name == "depth 1000 baselines"
+    if (way, frame, dtype) == ("long", "world", torch.float64) and lost:
+        # Steps of the normal matrix alone do not reach the rows' digits, see dlt.py.
+        pytest.xfail("many points in the world's frame lose digits by their normal matrix")
     case = hard(name, views, dtype)
     with mpmath.workdps(DIGITS):
-        world = exact_frames(case, "world")
-        frames = exact_frames(case, "rig") if frame == "rig" else world
-        exact, exact_in_world = exact_points(case, frames), exact_points(case, world)
-        by_svd, by_world_svd = svd_points(case, frames), svd_points(case, world)
-        found = triangulate(case.proj, case.pixels, case.weights, frame=frame)  # type: ignore[arg-type]
+        known = oracle(name, views, dtype)
+        exact, exact_in_world = known.exact[frame], known.exact["world"]
+        by_svd, by_world_svd = known.by_svd[frame], known.by_svd["world"]
+        with by(way):
+            found = triangulate(case.proj, case.pixels, case.weights, frame=frame)  # type: ignore[arg-type]
         # Noise of 1000 baselines leaves little to the world's frame: most points lie behind.
         assert found.valid.sum() >= (2 if "baselines" in name else COUNT // 2)
         ours, theirs = [], []
@@ -202,11 +232,15 @@ def test_points_are_as_exact_as_an_svd_makes_them(
     assert middle[0] <= 3 * middle[1], f"{middle[0]:.1e}, an SVD {middle[1]:.1e}: medians"
 
 
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", CASES)
-def test_in_the_rig_frame_float32_loses_only_what_its_outputs_cannot_hold(name: str) -> None:
+def test_in_the_rig_frame_float32_loses_only_what_its_outputs_cannot_hold(
+    name: str, way: str
+) -> None:
     case = hard(name, 5, torch.float32)
-    single = triangulate(case.proj, case.pixels, case.weights)
-    double = triangulate(*(tensor.double() for tensor in case[:3]))
+    with by(way):
+        single = triangulate(case.proj, case.pixels, case.weights)
+        double = triangulate(*(tensor.double() for tensor in case[:3]))
     both = single.valid & double.valid
     assert both.sum() >= COUNT // 2
     apart = (single.points.double() - double.points).abs().amax(dim=-1)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from solvers import WAYS, by
 from torch import Tensor
 
 from deltas_geom import (
@@ -227,6 +228,12 @@ def check_gradients(
 
 
 def run_triangulate(batch: Batch, gradients: bool) -> None:
+    for way in WAYS:
+        with by(way):
+            run_one_way(batch, gradients)
+
+
+def run_one_way(batch: Batch, gradients: bool) -> None:
     inputs = leaf(batch.proj), leaf(batch.pixels), leaf(batch.weights)
     found = triangulate(*inputs, batch.mask, covariance=True)
     check_found(batch, found)
