@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.numerics.sums import product
 
 
@@ -32,7 +33,7 @@ def correction(fundamental: Tensor, xy: Tensor, safe: Callable[[Tensor], Tensor]
     half = (squared1 + squared2) / 2
     under = half * half - curve * error
     real = under > 0
-    root = torch.where(real, under, 1.0).sqrt()
+    root = safe_sqrt(torch.where(real, under, 1.0))
     # Gross errors near the epipoles have no such pair: there one pixel moves to the other's line.
     k = error / safe(torch.where(real, half + root, torch.maximum(squared1, squared2)))
     k1 = torch.where(real | (squared1 >= squared2), k, 0.0)

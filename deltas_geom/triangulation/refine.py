@@ -92,7 +92,7 @@ def refine_points(
         gradient: values do not depend on it. "implicit" is 0 where there is no strict minimum.
 
     Returns:
-        Points, residual, could they be refined? Nothing raises or turns NaN because of values.
+        Points, residual (large also of pixels (N, V, 2), N = V), could they be refined? No NaN.
 
     Raises:
         ShapeError, TypeError: a trailing shape differs, there is no view, the mask is not bool.
@@ -230,7 +230,7 @@ def _descend(problem: _Problem, steps: int) -> _End:
         # Rounding must not refuse a step at the optimum, of which it carries the gradient.
         rounded = cost * (1 + 32 * torch.finfo(cost.dtype).eps) + noise
         # What is refused once would be refused again: from there the fit does not matter.
-        moving = moving & (fit.cost < torch.add(rounded, (cost * noise).sqrt(), alpha=2))
+        moving = moving & (fit.cost < torch.add(rounded, safe_sqrt(cost * noise), alpha=2))
         x, y, z = (torch.where(moving, b, a) for a, b in ((x, nx), (y, ny), (z, nz)))
         error, cost = torch.where(moving, fit.error, error), torch.where(moving, fit.cost, cost)
     return (x, y, z), error, valid

@@ -208,6 +208,7 @@ class _Solved(NamedTuple):
         shift: ``(*B, 2, 2, N)`` px, given less corrected pixels.
         depth: ``(*B, 2, N)``.
         parallax: ``(*B, N)`` rad, without gradient.
+        sine: ``(*B, N)`` of that.
         beside: ``(*B, 2, N)`` metres by which the other's ray passes each camera; likewise.
     """
 
@@ -215,6 +216,7 @@ class _Solved(NamedTuple):
     shift: Tensor
     depth: Tensor
     parallax: Tensor
+    sine: Tensor
     beside: Tensor
 
 
@@ -242,9 +244,11 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     # From both cameras, so that their order does not count.
     points = (rig.centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
     with torch.no_grad():
-        beside = torch.stack([dot(one, one).sqrt() for one in passing], dim=-2)
-        parallax = torch.atan2(squared.sqrt(), dot(first, second))
-    return _Solved(points, shift, along / size, parallax, beside)
+        beside = torch.stack([safe_sqrt(dot(one, one)) for one in passing], dim=-2)
+        length, cosine = safe_sqrt(squared), dot(first, second)
+        sine = length * safe(squared + cosine * cosine).rsqrt()
+        parallax = torch.atan2(length, cosine)
+    return _Solved(points, shift, along / size, parallax, sine, beside)
 
 
 def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
@@ -257,7 +261,7 @@ def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
     farther = solved.beside.amax(dim=-2)
     posed = (length > 128 * eps * size) & (farther > 8 * eps * (size + length))
     # The law of sines: the baseline and a distance, without the point, which may be anywhere.
-    near = solved.parallax.sin() * length > 32 * eps * farther
+    near = solved.sine * length > 32 * eps * farther
     near = near & solved.points.to(seen.dtype).isfinite().all(dim=-2)
     # At a camera's centre the depth is 0 within rounding.
     apart = solved.beside > 64 * torch.finfo(length.dtype).eps * length.unsqueeze(-2)
@@ -281,8 +285,7 @@ def _describe(seen: _Seen, solved: _Solved, valid: Tensor, covariance: bool) -> 
         "errors": safe_sqrt(squared),
     }
     if covariance:
-        x, y, z = points.unbind(dim=-2)
-        again = reproject(seen.proj, (x, y, z), both.expand_as(squared))
+        again = reproject(seen.proj, _components(points), both.expand_as(squared))
         noise = covariance_of(seen.proj, again, torch.ones_like(squared))
         found["covariance"] = unpacked3(noise)
     return found
