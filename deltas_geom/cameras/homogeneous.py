@@ -1,5 +1,6 @@
 """To and from homogeneous coordinates, without a division by zero."""
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -47,9 +48,9 @@ def safe_divide(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor
 def safe_sqrt(squared: Tensor) -> Tensor:
     """Square roots of any shape; 0 with zero gradient unless ``squared`` is positive.
 
-    At 0, as of a perfect match, the slope is infinite.
+    At 0, as of a perfect match, the slope is infinite; near it, parts of it overflow.
     """
-    positive = unless_all(squared > 0)
+    positive = unless_all(squared > torch.finfo(squared.dtype).tiny ** 0.6)
     # Double where, as above.
     safe = only(squared, positive, other=1.0)
     # Not sqrt, for which torch starts threads from 2048 numbers on.

@@ -23,7 +23,7 @@ class ShortWay:
     def __init__(self, rig: ShortRig, frame: Frame, dtype: torch.dtype) -> None:
         self.rig, self.fixed = rig, frame == "world"
         self.dtype = np.dtype(np.float64 if dtype == torch.float64 else np.float32)
-        self._solved: Solved | None = None
+        self._last: tuple[object, Solved] | None = None
 
     def solved(
         self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
@@ -57,7 +57,8 @@ class ShortWay:
         mask: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
         """Gradients by cameras, pixels and weights of points with this gradient."""
-        solved = self._solved or self._solve(pixels, weights, mask)
+        known = self._last is not None and self._last[0] == _place_of(pixels)
+        solved = self._last[1] if self._last and known else self._solve(pixels, weights, mask)
         outer = gradient.numpy().astype(np.float64)
         proj, by_pixels, by_size = gradients(
             self.rig, solved, outer, fixed=self.fixed, of_cameras=needed[0]
@@ -85,10 +86,15 @@ class ShortWay:
 
     def _solve(self, *seen: Tensor | None) -> Solved:
         pixels, weights, mask = (None if t is None else t.detach().numpy() for t in seen)
-        assert pixels is not None
-        self._solved = solve(self.rig, pixels, weights, mask, fixed=self.fixed, dtype=self.dtype)
-        return self._solved
+        assert pixels is not None and seen[0] is not None
+        solved = solve(self.rig, pixels, weights, mask, fixed=self.fixed, dtype=self.dtype)
+        self._last = _place_of(seen[0]), solved  # for the backward pass, if it is the same chunk
+        return solved
 
     def _outward(self, values: Array) -> Tensor:
         limit = float(np.finfo(self.dtype).max)  # type: ignore[type-var]
         return torch.from_numpy(np.minimum(np.maximum(values, -limit), limit).astype(self.dtype))
+
+
+def _place_of(pixels: Tensor) -> tuple[object, ...]:
+    return pixels.data_ptr(), pixels.shape, pixels.stride()

@@ -156,9 +156,11 @@ class Call:
         self.alike = weights is None and mask is None
         # What a compiler, a transform or another device holds has no values to look at.
         plain = all(t is None or (values_at_hand(t) and t.dtype in _PLAIN) for t in self.tensors)
-        few = 0 < self.batch.numel() * pixels.shape[-2] <= FEW
+        count = self.batch.numel() * pixels.shape[-2]
+        # The normal matrix of the world's frame loses digits that an SVD of the rows keeps.
+        exactly = frame == "world" and proj.dtype == torch.float64
         self.way: ShortWay | LongWay
-        if plain and few and not transformed(*self.tensors):
+        if plain and count > 0 and (count <= FEW or exactly) and not transformed(*self.tensors):
             self.way = ShortWay(known.short(), frame, proj.dtype)
         else:
             self.way = self.long(known.long())

@@ -54,9 +54,6 @@ def gradients(solver: Solver, inputs: Inputs) -> tuple[Fields, Inputs]:
         some["residual"] = found["residual"].square()  # at 0 it has a slope itself
     real = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
     pulled = torch.autograd.grad(total(some), list(real.values()), materialize_grads=True)
-    if solver.takes("rays") and any(each.isnan().any() for each in pulled):
-        # Still to be mended: the slope of s * s.rsqrt() overflows for squares below 1e-205.
-        pytest.xfail("safe_sqrt has no gradient of a residual below 1e-100")
     return found, dict(zip(real, pulled, strict=True))
 
 
