@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
-from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.arithmetic import at_least_in_single, solver_dtype, without_autocast
 from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import Cameras, Vector3, cameras_of, clean_pixels
@@ -83,7 +83,7 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     return parallax_of(cameras.centers, places, counted).to(proj.dtype)
 
 
-@without_autocast
+@at_least_in_single
 def point_covariance(
     proj: Tensor,
     points: Tensor,
@@ -112,8 +112,8 @@ def point_covariance(
     Returns:
         0 where fewer than two views see the point, or something used is not finite: nothing is
         stated. A direction in which nothing is known has a large, finite variance. A covariance
-        that does not fit the dtype is its largest number times the identity. What unused views
-        hold (camera, pose) has no effect.
+        that does not fit the dtype, which is float32 at least, is its largest number times the
+        identity. What unused views hold (camera, pose) has no effect.
 
     Raises:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.

@@ -533,7 +533,15 @@ def test_fewer_than_two_views_state_nothing_and_one_line_states_a_large_variance
     assert (point_covariance(proj, behind, torch.ones(3, 1).double()) == 0).all()
 
 
-@pytest.mark.parametrize("kind", [torch.float16, torch.float32, torch.float64], ids=str)
+def test_covariances_of_half_precision_are_single() -> None:
+    scene = three_views()
+    half = [tensor.half() for tensor in (scene.views.proj, scene.points, torch.ones(3, 2) / 300)]
+    found = point_covariance(*half)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, point_covariance(*(tensor.float() for tensor in half)))
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
 def test_what_is_too_large_for_the_dtype_is_a_multiple_of_the_identity(kind: torch.dtype) -> None:
     scene, largest = three_views(), torch.finfo(kind).max
     proj, points = (tensor.to(kind) for tensor in (scene.views.proj, scene.points))
