@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-_NUMBERS = {str(number): number for number in range(10)}
+_NUMBERS = {str(number): number for number in range(1000)}
 _CURES = {"ndarray": "torch.from_numpy({0})", "PosedViews": "{0}.proj, or a field of it"}
 
 
@@ -34,7 +34,7 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
         ...
         deltas_geom.checks.ShapeError: pixels must have shape (*B, N, 2), got (7, 3)
     """
-    sizes = _NUMBERS.copy()
+    sizes: dict[str, int] = {}
     for name, (tensor, spec) in named.items():
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             check_tensor(**{name: tensor})
@@ -44,7 +44,7 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
         tail = shape[-len(dims) :]
         fits = len(tail) == len(dims)
         for dim, size in zip(dims, tail, strict=False):
-            fits = fits and sizes.setdefault(dim, size) == size
+            fits = fits and size == (_NUMBERS.get(dim) or sizes.setdefault(dim, size))
             fits = fits and (size > 0 or f"+{dim}" not in spec)
         if not fits:
             raise ShapeError(_misfit(named, name, sizes))
@@ -58,12 +58,12 @@ def _misfit(named: dict[str, tuple[Tensor, str]], name: str, sizes: dict[str, in
     if len(tail) < len(dims):
         return f"{name} {wanted}"
     pairs = list(zip(dims, tail, strict=True))
-    if any(dim in _NUMBERS and sizes[dim] != size for dim, size in pairs):
+    if any(_NUMBERS.get(dim, size) != size for dim, size in pairs):
         return f"{name} {wanted}"
     for dim, size in pairs:
         if size == 0 and f"+{dim}" in spec:
             return f"{name} must have {dim} >= 1, got {shape}"
-        if size != sizes[dim]:
+        if size != sizes.get(dim, size):
             break
     first = next(other for other, (_, its) in named.items() if dim in its.replace("+", "").split())
     return f"{name} has {dim} = {size} but {first} has {dim} = {sizes[dim]}; {name} {wanted}"

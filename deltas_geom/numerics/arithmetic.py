@@ -86,7 +86,8 @@ def only(values: Tensor, *masks: Tensor | None, other: float = 0.0) -> Tensor:
     """The values where all masks are True, a mask that is None being so; elsewhere ``other``."""
     for mask in masks:
         if mask is not None:
-            values = torch.where(mask, values, other)
+            # Of two masks: onnxruntime knows no "where" of bools.
+            values = values & mask if other is False else torch.where(mask, values, other)
     return values
 
 
