@@ -5,7 +5,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import ShapeError, check_bool, check_shapes
+from deltas_geom.checks import ShapeError, check_bool, check_positive, check_shapes
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
 from deltas_geom.diagnosis.hypotheses import Hypothesis, resized
@@ -95,8 +95,7 @@ def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: 
         raise ShapeError("diagnose takes one set of views: no batch dims")
     if views.num_views < 2:
         raise ShapeError(f"diagnose needs 2 views or more, got {views.num_views}")
-    if not threshold > 0:
-        raise ValueError(f"threshold must be positive, got {threshold}")
+    check_positive(threshold=threshold)
     for name, tensor in zip(("K", "cam_from_world"), views, strict=True):
         bad = ~tensor.isfinite().flatten(1).all(dim=-1)
         if bool(bad.any()):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.checks import check_positive
 from deltas_geom.numerics.arithmetic import surely_all, without_autocast
 from deltas_geom.numerics.sums import product
 from deltas_geom.status import Status
@@ -84,8 +85,7 @@ def triangulate_robust(
         ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
     check_observed(proj, pixels, weights, mask)
-    if not threshold > 0:
-        raise ValueError(f"threshold must be positive, got {threshold}")
+    check_positive(threshold=threshold)
     if min_inliers < 2:
         raise ValueError(f"min_inliers must be 2 or more, got {min_inliers}")
     if max_pairs < 1:
