@@ -23,7 +23,13 @@ REWRITES = {
     "resize_pixels",
     "to_homogeneous",
 }
-AT_LEAST_SINGLE = {"correlate", "correlate_normalized", "fundamental_between", "sample_map"}
+AT_LEAST_SINGLE = {
+    "correlate",
+    "correlate_normalized",
+    "fundamental_between",
+    "point_covariance",
+    "sample_map",
+}
 # Ends of segments are in the image or not by rounding, and poses in half precision rigid.
 BY_ROUNDING = {"correlate, lines", "is_rigid"}
 TAKES_PARTS = {  # of tensors: the table above, not the function
