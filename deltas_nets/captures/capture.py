@@ -14,6 +14,7 @@ from deltas_nets.captures.frame import Frame as Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words, nearest_ids
 from deltas_nets.captures.images import ImageMemory
+from deltas_nets.captures.points import SparsePoints
 from deltas_nets.errors import UserError
 
 __all__ = ["Capture", "FloatArray", "Frame", "Lost"]
@@ -48,6 +49,16 @@ class Capture:
     """Frames left out."""
     doubts: tuple[str, ...] = ()
     """What may be a mistake, each for a warning."""
+    layout: str = ""
+    """The format, in a word or two, as "COLMAP text"."""
+    metric: bool = True
+    """Whether its unit is the metre; structure from motion alone does not know it."""
+    points: SparsePoints | None = None
+    """What the program that found the poses triangulated, if it says so."""
+    sources: Mapping[str, tuple[str, ...]] | None = None
+    """Ids of the views that the capture's program puts to each frame, best first."""
+    depth_ranges: FloatArray | None = None
+    """``(F, 2)`` nearest and farthest depth of each frame, if its program states them."""
 
     def fingerprint(self) -> str:
         """A hash of all cameras: what changes when poses or intrinsics do."""
@@ -80,7 +91,14 @@ class Capture:
         if not mask.any():
             return self
         gone = dict.fromkeys(self.frames.kept(mask), why)
-        return replace(self, frames=self.frames.kept(~mask), lost={**self.lost, **gone})
+        points, ranges = self.points, self.depth_ranges
+        return replace(
+            self,
+            frames=self.frames.kept(~mask),
+            lost={**self.lost, **gone},
+            points=None if points is None else points._replace(seen=points.seen.kept(~mask)),
+            depth_ranges=None if ranges is None else ranges[~mask],
+        )
 
     def remembering(self, capacity: int = MEMORY) -> "Capture":
         """The same capture, which decodes an image once while memory allows.

@@ -6,17 +6,22 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from deltas_nets.captures.images import Header, ImageMemory, decode, header_of_whole_file
+from deltas_nets.captures.depth_files import MILLIMETRES, depth_format
+from deltas_nets.captures.images import (
+    Header,
+    ImageMemory,
+    Span,
+    decode,
+    header_of,
+    header_of_whole_file,
+    in_words,
+)
 from deltas_nets.errors import UserError
 
 __all__ = ["FloatArray", "Frame", "Lens"]
 
 FloatArray = NDArray[np.float64]
-
-UNKNOWN_DEPTH = 65535
-"""7-Scenes and some headsets write this for "no depth", beside 0."""
 
 _COPY_AGAIN = "copy the file again, or remove it (and the frame from view sets)"
 
@@ -50,8 +55,14 @@ class Frame:
     """(3, 3) intrinsics of the depth image; None where it sees what the colour image sees."""
     depth_size: tuple[int, int] | None = None
     """(height, width) of the depth image; None where any will do."""
+    depth_scale: float = MILLIMETRES
+    """Steps of the depth image in a metre, where it holds whole numbers."""
     lens: Lens | None = None
     """None where straight lines are straight; images with another lens are refused."""
+    image_span: Span | None = None
+    """Which bytes of ``image_path`` are the image; None for the whole file."""
+    depth_span: Span | None = None
+    """Which bytes of ``depth_path`` are the depth."""
     memory: ImageMemory | None = None
     """Where decoded images are kept, if anywhere."""
 
@@ -67,7 +78,7 @@ class Frame:
         """
         if self.memory is None:
             return self._decode_image()
-        return self.memory.get(self.image_path, self._decode_image)
+        return self.memory.get((self.image_path, self.image_span), self._decode_image)
 
     def check_image(self) -> None:
         """Raise what :meth:`read_image` would; decode only where the file's header cannot tell.
@@ -75,7 +86,7 @@ class Frame:
         Raises:
             UserError: as :meth:`read_image`.
         """
-        header = header_of_whole_file(self.image_path)
+        header = header_of_whole_file(self.image_path, self.image_span)
         if header is None:
             self.read_image()
         else:
@@ -91,11 +102,10 @@ class Frame:
             UserError: the frame has none, or the file is damaged, not a 16-bit image, or of another
                 size.
         """
-        image = decode(self._depth_path(), remedy="copy the file again")
-        self._check_depth(_header(image))
-        millimetres = np.asarray(image).astype(np.int64)
-        unknown = (millimetres <= 0) | (millimetres >= UNKNOWN_DEPTH)
-        return np.where(unknown, 0.0, millimetres / 1000.0).astype(np.float32)
+        path = self._depth_path()
+        depth = depth_format(path).read(path, self.depth_span, self.depth_scale)
+        self._check_depth_size((depth.shape[0], depth.shape[1]))
+        return depth
 
     def check_depth(self) -> None:
         """Raise what :meth:`read_depth` would, as :meth:`check_image` does.
@@ -103,15 +113,16 @@ class Frame:
         Raises:
             UserError: as :meth:`read_depth`.
         """
-        header = header_of_whole_file(self._depth_path())
-        if header is None:
+        path = self._depth_path()
+        size = depth_format(path).size_of_whole_file(path, self.depth_span)
+        if size is None:
             self.read_depth()
         else:
-            self._check_depth(header)
+            self._check_depth_size(size)
 
     def _decode_image(self) -> NDArray[np.uint8]:
-        image = decode(self.image_path, remedy=_COPY_AGAIN)
-        self._check_image(_header(image))
+        image = decode(self.image_path, self.image_span, remedy=_COPY_AGAIN)
+        self._check_image(header_of(image))
         pixels = np.asarray(image.convert("RGB"))
         pixels.setflags(write=False)
         return pixels
@@ -126,8 +137,8 @@ class Frame:
             what = f"image has pixels of type {header.mode}, not 8-bit colour"
             raise UserError(what, self.image_path, "convert it to an 8-bit JPEG or PNG")
         if header.size != self.image_size:
-            what = f"image is {_words(header.size)}, the intrinsics are for "
-            what += _words(self.image_size)
+            what = f"image is {in_words(header.size)}, the intrinsics are for "
+            what += in_words(self.image_size)
             raise UserError(what, self.image_path, "export all images of a capture at one size")
 
     def _depth_path(self) -> Path:
@@ -136,20 +147,8 @@ class Frame:
             raise UserError(f"frame {self.id} has no sensor depth", file, "add the file")
         return self.depth_path
 
-    def _check_depth(self, header: Header) -> None:
-        path = self._depth_path()
-        if not header.mode.startswith("I"):
-            what = f"depth has pixels of type {header.mode}, not 16-bit millimetres"
-            raise UserError(what, path, "export depth as a 16-bit grey PNG")
-        if self.depth_size not in (None, header.size):
+    def _check_depth_size(self, size: tuple[int, int]) -> None:
+        if self.depth_size not in (None, size):
             of = "the others are" if self.depth_K is None else "the intrinsics are for"
-            what = f"depth is {_words(header.size)}, {of} {_words(self.depth_size)}"
-            raise UserError(what, path, "export all depth of a capture at one size")
-
-
-def _header(image: Image.Image) -> Header:
-    return Header((image.height, image.width), image.mode)
-
-
-def _words(size: tuple[int, int]) -> str:
-    return f"{size[1]}x{size[0]}"
+            what = f"depth is {in_words(size)}, {of} {in_words(self.depth_size)}"
+            raise UserError(what, self._depth_path(), "export all depth of a capture at one size")

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deltas_nets.captures.depth_files import MILLIMETRES
 from deltas_nets.captures.frame import FloatArray, Frame, Lens
 from deltas_nets.captures.ids import natural_key
-from deltas_nets.captures.images import ImageMemory
+from deltas_nets.captures.images import ImageMemory, Span
 
 __all__ = ["Camera", "FrameArrays", "Frames"]
 
@@ -24,6 +25,7 @@ class Camera(NamedTuple):
     depth_K: FloatArray | None
     depth_size: tuple[int, int] | None
     lens: Lens | None
+    depth_scale: float = MILLIMETRES
 
 
 class FrameArrays(NamedTuple):
@@ -36,6 +38,8 @@ class FrameArrays(NamedTuple):
         depths: ``(F,)`` files, from the folder; empty where there is none.
         cameras: every camera once.
         camera_of: ``(F,)`` whose position says which one took a frame.
+        image_spans: ``(F, 2)`` start and length of the bytes that are the image, None if all are.
+        depth_spans: the same of the depth.
     """
 
     ids: NDArray[np.bytes_]
@@ -44,6 +48,8 @@ class FrameArrays(NamedTuple):
     depths: NDArray[np.bytes_]
     cameras: tuple[Camera, ...]
     camera_of: NDArray[np.int32]
+    image_spans: NDArray[np.int64] | None = None
+    depth_spans: NDArray[np.int64] | None = None
 
 
 class Frames(Mapping[str, Frame]):
@@ -77,7 +83,14 @@ class Frames(Mapping[str, Frame]):
         kinds: list[Camera] = []
         camera_of = []
         for frame in ordered:
-            camera = Camera(frame.image_size, frame.K, frame.depth_K, frame.depth_size, frame.lens)
+            camera = Camera(
+                frame.image_size,
+                frame.K,
+                frame.depth_K,
+                frame.depth_size,
+                frame.lens,
+                frame.depth_scale,
+            )
             key = tuple(_hashable(part) for part in camera)
             if key not in cameras:
                 cameras[key] = len(kinds)
@@ -91,6 +104,8 @@ class Frames(Mapping[str, Frame]):
             _words(_name(frame.depth_path, folder) for frame in ordered),
             tuple(kinds),
             np.array(camera_of, dtype=np.int32),
+            _spans(frame.image_span for frame in ordered),
+            _spans(frame.depth_span for frame in ordered),
         )
         return cls(folder, arrays)
 
@@ -146,7 +161,10 @@ class Frames(Mapping[str, Frame]):
             depth_path=self.folder / fsdecode(depth) if depth else None,
             depth_K=camera.depth_K,
             depth_size=camera.depth_size,
+            depth_scale=camera.depth_scale,
             lens=camera.lens,
+            image_span=_span(arrays.image_spans, position),
+            depth_span=_span(arrays.depth_spans, position),
             memory=self.memory,
         )
 
@@ -161,6 +179,8 @@ class Frames(Mapping[str, Frame]):
                 images=arrays.images[mask],
                 depths=arrays.depths[mask],
                 camera_of=arrays.camera_of[mask],
+                image_spans=None if arrays.image_spans is None else arrays.image_spans[mask],
+                depth_spans=None if arrays.depth_spans is None else arrays.depth_spans[mask],
             ),
             memory=self.memory,
         )
@@ -176,6 +196,18 @@ class Frames(Mapping[str, Frame]):
 
 def _words(words: Iterable[bytes]) -> NDArray[np.bytes_]:
     return np.array(list(words), dtype=np.bytes_)
+
+
+def _spans(spans: Iterable[Span | None]) -> NDArray[np.int64] | None:
+    known = [(-1, -1) if span is None else span for span in spans]
+    array = np.array(known, dtype=np.int64).reshape(-1, 2)
+    return array if (array >= 0).any() else None
+
+
+def _span(spans: NDArray[np.int64] | None, position: int) -> Span | None:
+    if spans is None or spans[position, 0] < 0:
+        return None
+    return Span(*spans[position].tolist())
 
 
 def _name(path: Path | None, folder: Path) -> bytes:

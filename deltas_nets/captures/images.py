@@ -2,9 +2,10 @@
 
 import os
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,28 @@ from PIL import Image
 
 from deltas_nets.errors import UserError
 
-__all__ = ["Header", "ImageMemory", "decode", "header_of_whole_file", "image_size_of"]
+__all__ = [
+    "Header",
+    "ImageMemory",
+    "Span",
+    "decode",
+    "header_of",
+    "header_of_whole_file",
+    "image_size_of",
+    "in_words",
+    "open_span",
+]
 
 _END_OF_JPEG = b"\xff\xd9"
 _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises where a file is no image, or a damaged one."""
+
+
+class Span(NamedTuple):
+    """Some bytes of a file that holds more than one image."""
+
+    start: int
+    length: int
 
 
 class Header(NamedTuple):
@@ -40,30 +58,39 @@ class ImageMemory:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self._known: OrderedDict[Path, NDArray[np.uint8]] = OrderedDict()
+        self._known: OrderedDict[Hashable, NDArray[np.uint8]] = OrderedDict()
         self._used = 0
 
-    def get(self, path: Path, read: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """The pixels of a file, from ``read`` if they are not known."""
-        if path not in self._known:
-            self._known[path] = read()
-            self._used += self._known[path].nbytes
-        pixels = self._known[path]
-        self._known.move_to_end(path)
+    def get(self, name: Hashable, read: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        """The pixels of a name, from ``read`` if they are not known."""
+        if name not in self._known:
+            self._known[name] = read()
+            self._used += self._known[name].nbytes
+        pixels = self._known[name]
+        self._known.move_to_end(name)
         while self._used > self.capacity:
             _, forgotten = self._known.popitem(last=False)
             self._used -= forgotten.nbytes
         return pixels
 
 
-def decode(path: Path, *, remedy: str) -> Image.Image:
+def open_span(path: Path, span: Span | None = None) -> BinaryIO:
+    """A file, or those bytes of it."""
+    if span is None:
+        return path.open("rb")
+    with path.open("rb") as file:
+        file.seek(span.start)
+        return BytesIO(file.read(span.length))
+
+
+def decode(path: Path, span: Span | None = None, *, remedy: str) -> Image.Image:
     """Decode every pixel, so that a file cut short is found here and not later.
 
     Raises:
         UserError: the file is missing, or no image, or a damaged one.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path if span is None else open_span(path, span)) as image:
             image.load()
             return image
     except FileNotFoundError as error:
@@ -74,7 +101,12 @@ def decode(path: Path, *, remedy: str) -> Image.Image:
         raise UserError(f"the image cannot be decoded{detail}", path, remedy) from error
 
 
-def header_of_whole_file(path: Path) -> Header | None:
+def header_of(image: Image.Image) -> Header:
+    """What Pillow read of an image."""
+    return Header((image.height, image.width), image.mode)
+
+
+def header_of_whole_file(path: Path, span: Span | None = None) -> Header | None:
     """The header of a file that is surely whole; None where only decoding it can tell.
 
     A PNG is whole if the checksums of its chunks are right, a JPEG if it ends with the marker of
@@ -82,8 +114,8 @@ def header_of_whole_file(path: Path) -> Header | None:
     that.
     """
     try:
-        with path.open("rb") as file, Image.open(file) as image:
-            header = Header((image.height, image.width), image.mode)
+        with open_span(path, span) as file, Image.open(file) as image:
+            header = header_of(image)
             if image.format == "PNG":
                 image.verify()
                 return header
@@ -102,3 +134,13 @@ def image_size_of(path: Path) -> tuple[int, int] | None:
             return image.height, image.width
     except _UNREADABLE:
         return None
+
+
+def in_words(size: tuple[int, int]) -> str:
+    """A size (height, width) as people write it.
+
+    Example:
+        >>> in_words((480, 640))
+        '640x480'
+    """
+    return f"{size[1]}x{size[0]}"

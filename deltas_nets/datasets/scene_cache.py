@@ -20,7 +20,7 @@ from deltas_nets.outputs.atomic_files import write_atomically
 
 __all__ = ["read_scene_cached"]
 
-VERSION = 3
+VERSION = 4
 """Raised whenever the same files give another scene."""
 WORDS = ("ids", "images", "depths")
 
@@ -110,6 +110,7 @@ def _camera(
     depth_K: list[list[float]] | None,
     depth_size: list[int] | None,
     lens: list[Any] | None,
+    depth_scale: float,
 ) -> Camera:
     return Camera(
         image_size=(image_size[0], image_size[1]),
@@ -117,6 +118,7 @@ def _camera(
         depth_K=None if depth_K is None else np.array(depth_K),
         depth_size=None if depth_size is None else (depth_size[0], depth_size[1]),
         lens=None if lens is None else Lens(lens[0], tuple(lens[1])),
+        depth_scale=depth_scale,
     )
 
 
