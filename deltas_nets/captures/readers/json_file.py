@@ -1,0 +1,163 @@
+"""JSON files of other programs, within bounds, and their values, which may be anything."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.errors import UserError
+
+__all__ = ["Fields", "read_json"]
+
+JSON_LIMIT = 256 * 2**20
+"""Bytes. Python takes ten times as much to hold what a file says."""
+
+
+def read_json(path: Path, *, name: str, remedy: str, limit: int = JSON_LIMIT) -> object:
+    """What a JSON file holds.
+
+    Args:
+        path: the file.
+        name: what it is, for errors, as "transforms".
+        remedy: what the user can do.
+        limit: bytes that it may have.
+
+    Raises:
+        UserError: it cannot be read, is larger, no UTF-8 or no JSON, nested too deeply, or names
+            one thing twice.
+    """
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            what = f"the {name} file has {size / 2**20:.0f} MiB, more than {limit / 2**20:g}"
+            raise UserError(what, path, remedy)
+        return json.loads(path.read_bytes().decode("utf-8-sig"), object_pairs_hook=_once)
+    except OSError as error:
+        what = f"the {name} file cannot be read ({error.strerror or error})"
+        raise UserError(what, path, remedy) from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"the {name} file is not text in UTF-8", path, remedy) from error
+    except ValueError as error:
+        raise UserError(f"the {name} file is not JSON ({error})", path, remedy) from error
+    except RecursionError as error:
+        raise UserError(f"the {name} file is nested too deeply", path, remedy) from error
+
+
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"{twice[:40]!r} is there twice")
+    return found
+
+
+class Fields:
+    """The values of a JSON object, each of the type that is asked for.
+
+    Args:
+        values: what should be an object.
+        path: the file, for errors.
+        where: what the object is, for errors, as "frame 3".
+        remedy: what the user can do.
+
+    Raises:
+        UserError: it is no object.
+    """
+
+    def __init__(self, values: object, path: Path, *, where: str, remedy: str) -> None:
+        self.path, self.where, self.remedy = path, where, remedy
+        if not isinstance(values, dict):
+            raise self.error("is no JSON object")
+        self.values: dict[str, object] = values
+
+    def error(self, what: str) -> UserError:
+        """An error about the object."""
+        return UserError(f"{self.where} {what}", self.path, self.remedy)
+
+    def __contains__(self, key: str) -> bool:
+        return self.values.get(key) is not None
+
+    def inner(self, key: str) -> "Fields":
+        """An object inside."""
+        return Fields(
+            self.values.get(key), self.path, where=f"{key} of {self.where}", remedy=self.remedy
+        )
+
+    def items(self, key: str) -> list[object]:
+        """A list, whatever is in it; empty where there is none.
+
+        Raises:
+            UserError: there is something else.
+        """
+        found = self.values.get(key, [])
+        if not isinstance(found, list):
+            raise self.error(f"has no list {key}")
+        return found
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A text.
+
+        Raises:
+            UserError: there is something else, or nothing and no default.
+        """
+        found = self.values.get(key, default)
+        if not isinstance(found, str):
+            raise self.error(
+                f"has no text {key}" if found is None else f"has a {key} that is no text"
+            )
+        return found
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number.
+
+        Raises:
+            UserError: there is something else, or nothing and no default.
+        """
+        if default is not None and self.values.get(key) is None:
+            return default
+        return float(self.numbers(key, ())[()])
+
+    def numbers(self, key: str, shape: tuple[int, ...], *, finite: bool = True) -> FloatArray:
+        """Numbers in nested lists.
+
+        Args:
+            key: their name.
+            shape: -1 for any length.
+            finite: whether they must be finite.
+
+        Raises:
+            UserError: there is something else, or nothing.
+        """
+        found = self.values.get(key)
+        if found is None:
+            raise self.error(f"has no {key}")
+        array = _array(found, shape)
+        if array is None:
+            form = " x ".join("any" if size < 0 else str(size) for size in shape)
+            wanted = f"{form} numbers" if shape else "a number"
+            raise self.error(f"has a {key} that is not {wanted}")
+        if finite and not np.isfinite(array).all():
+            raise self.error(f"has a {key} that is not finite")
+        return array
+
+
+def _array(found: object, shape: tuple[int, ...]) -> FloatArray | None:
+    if not _all_numbers(found, len(shape)):
+        return None
+    try:
+        array = np.array(found, dtype=np.float64)
+    except (ValueError, OverflowError):  # lists of different lengths, whole numbers without end
+        return None
+    same = array.ndim == len(shape) and all(
+        wanted in (-1, size) for wanted, size in zip(shape, array.shape, strict=True)
+    )
+    return array if same else None
+
+
+def _all_numbers(found: object, depth: int) -> bool:
+    """Whether it is numbers in so many lists; NumPy would take words and truths for numbers."""
+    if depth:
+        return isinstance(found, list) and all(_all_numbers(item, depth - 1) for item in found)
+    return isinstance(found, int | float) and not isinstance(found, bool)
