@@ -49,9 +49,10 @@ def cut_points(
 
 
 def serial_points(tensor: Tensor) -> int:
-    """How many points of ``(*B, V, N, K)`` all operations on their views compute in one thread."""
-    if torch.get_num_threads() == 1:
-        return _CHUNK
+    """How many points of ``(*B, V, N, K)`` all operations on their views compute in one thread.
+
+    The same however many threads torch may start: a pass costs what it costs with one.
+    """
     return max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
 
 
