@@ -27,13 +27,13 @@ class Lost(NamedTuple):
     """Why a frame is not used.
 
     Attributes:
-        reason: "no pose" where there is none or tracking was lost, which happens; "malformed" and
-            "not rigid" where a pose is there and is none; "no depth" and "listed" where training
-            leaves the frame out.
+        reason: "no pose" where there is none or tracking was lost, which happens; "no image" where
+            the capture names one that is not there; "malformed" and "not rigid" where a pose is
+            there and is none; "no depth" and "listed" where training leaves the frame out.
         error: what asking for the frame raises.
     """
 
-    reason: Literal["no pose", "malformed", "not rigid", "no depth", "listed"]
+    reason: Literal["no pose", "no image", "malformed", "not rigid", "no depth", "listed"]
     error: UserError
 
 

@@ -1,5 +1,6 @@
 """Files of sensor depth: a table of formats, each of which reads metres."""
 
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -7,29 +8,49 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deltas_nets.captures.exr import read_exr
+from deltas_nets.captures.float_files import read_npy, read_pfm
 from deltas_nets.captures.images import Header, Span, decode, header_of, header_of_whole_file
+from deltas_nets.captures.images import open_span as open_span
 from deltas_nets.errors import UserError
 
-__all__ = ["DEPTH_FORMATS", "MILLIMETRES", "DepthFormat", "depth_format"]
+__all__ = ["DEPTH_FORMATS", "MILLIMETRES", "DepthFormat", "StoredDepth", "depth_format"]
 
 MILLIMETRES = 1000.0
 """Steps in a metre."""
 UNKNOWN_DEPTH = 65535
 """7-Scenes and some headsets write this for "no depth", beside 0."""
+FILE_LIMIT = 2**30
+"""Bytes of a file of floats."""
+
+
+class StoredDepth(NamedTuple):
+    """Where the depth of a frame is.
+
+    Attributes:
+        path: the file.
+        span: which bytes of it are the depth; None for all.
+        scale: steps in a metre, where whole numbers are stored.
+        size: (height, width); None where the file alone says it.
+    """
+
+    path: Path
+    span: Span | None
+    scale: float
+    size: tuple[int, int] | None
 
 
 class DepthFormat(NamedTuple):
     """How the depth of files with a suffix is read.
 
     Attributes:
-        read: from a file, the bytes of it that count (None for all), and the steps in a metre to
-            ``(H, W)`` metres, 0 where unknown; raises `UserError`.
+        read: to ``(H, W)`` metres, 0 where unknown; raises `UserError`.
         size_of_whole_file: (height, width) of a file that is surely whole, None where only
             reading it can tell; raises `UserError` for what is no depth.
     """
 
-    read: Callable[[Path, Span | None, float], NDArray[np.float32]]
-    size_of_whole_file: Callable[[Path, Span | None], tuple[int, int] | None]
+    read: Callable[[StoredDepth], NDArray[np.float32]]
+    size_of_whole_file: Callable[[StoredDepth], tuple[int, int] | None]
 
 
 def depth_format(path: Path) -> DepthFormat:
@@ -37,19 +58,22 @@ def depth_format(path: Path) -> DepthFormat:
     return DEPTH_FORMATS.get(path.suffix.lower(), _STEPS)
 
 
-def _read_steps(path: Path, span: Span | None, scale: float) -> NDArray[np.float32]:
-    image = decode(path, span, remedy="copy the file again")
-    _check_steps(header_of(image), path)
-    steps = np.asarray(image).astype(np.int64)
+def _metres(steps: NDArray[np.int64], scale: float) -> NDArray[np.float32]:
     unknown = (steps <= 0) | (steps >= UNKNOWN_DEPTH)
     return np.where(unknown, 0.0, steps / scale).astype(np.float32)
 
 
-def _size_of_steps(path: Path, span: Span | None) -> tuple[int, int] | None:
-    header = header_of_whole_file(path, span)
+def _read_steps(stored: StoredDepth) -> NDArray[np.float32]:
+    image = decode(stored.path, stored.span, remedy="copy the file again")
+    _check_steps(header_of(image), stored.path)
+    return _metres(np.asarray(image).astype(np.int64), stored.scale)
+
+
+def _size_of_steps(stored: StoredDepth) -> tuple[int, int] | None:
+    header = header_of_whole_file(stored.path, stored.span)
     if header is None:
         return None
-    _check_steps(header, path)
+    _check_steps(header, stored.path)
     return header.size
 
 
@@ -59,7 +83,62 @@ def _check_steps(header: Header, path: Path) -> None:
         raise UserError(what, path, "export depth as a 16-bit grey PNG")
 
 
+def _floats(
+    read: Callable[[bytes, Path], NDArray[np.float32]],
+) -> Callable[[StoredDepth], NDArray[np.float32]]:
+    def read_file(stored: StoredDepth) -> NDArray[np.float32]:
+        depth = read(_bytes(stored), stored.path)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+    return read_file
+
+
+def _bytes(stored: StoredDepth) -> bytes:
+    try:
+        length = stored.path.stat().st_size if stored.span is None else stored.span.length
+        if length > FILE_LIMIT or not stored.path.is_file():
+            what = f"the depth is no file of less than {FILE_LIMIT // 2**20} MiB"
+            raise UserError(what, stored.path, "export depth as a 16-bit grey PNG")
+        with open_span(stored.path, stored.span) as file:
+            return file.read()
+    except FileNotFoundError as error:
+        raise UserError("the depth does not exist", stored.path, "copy the file again") from error
+
+
+def _read_packed_steps(stored: StoredDepth) -> NDArray[np.float32]:
+    """16-bit whole numbers inside of a larger file, stored or deflated.
+
+    What unpacks to more than the depth that is due is not unpacked further.
+    """
+    damaged = UserError(
+        "depth inside of the file is damaged", stored.path, "copy or export the file again"
+    )
+    if stored.size is None or stored.span is None:
+        raise damaged
+    due = 2 * stored.size[0] * stored.size[1]
+    data = _bytes(stored)
+    if len(data) != due:
+        try:
+            data = zlib.decompressobj().decompress(data, due)
+        except zlib.error as error:
+            raise damaged from error
+    if len(data) != due:
+        raise damaged
+    return _metres(np.frombuffer(data, "<u2").reshape(stored.size).astype(np.int64), stored.scale)
+
+
+def _only_reading_tells(stored: StoredDepth) -> None:
+    return None
+
+
 _STEPS = DepthFormat(_read_steps, _size_of_steps)
 
-DEPTH_FORMATS = {".png": _STEPS}
-"""By suffix. What is not here is read as an image of whole numbers."""
+DEPTH_FORMATS = {
+    ".png": _STEPS,
+    ".exr": DepthFormat(_floats(read_exr), _only_reading_tells),
+    ".pfm": DepthFormat(_floats(read_pfm), _only_reading_tells),
+    ".npy": DepthFormat(_floats(read_npy), _only_reading_tells),
+    ".sens": DepthFormat(_read_packed_steps, _only_reading_tells),
+}
+"""By suffix. What is not here is read as an image of whole numbers. Files of floats hold metres, or
+the capture's unit."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deltas_nets.captures.depth_files import MILLIMETRES, depth_format
+from deltas_nets.captures.depth_files import MILLIMETRES, StoredDepth, depth_format
 from deltas_nets.captures.images import (
     Header,
     ImageMemory,
@@ -55,6 +55,9 @@ class Frame:
     """(3, 3) intrinsics of the depth image; None where it sees what the colour image sees."""
     depth_size: tuple[int, int] | None = None
     """(height, width) of the depth image; None where any will do."""
+    cam_from_depth: FloatArray | None = None
+    """(4, 4) where the depth camera stands; None where depth is registered: as the colour camera.
+    `deltas_nets.captures.register.register_depth` moves depth to the colour image."""
     depth_scale: float = MILLIMETRES
     """Steps of the depth image in a metre, where it holds whole numbers."""
     lens: Lens | None = None
@@ -103,7 +106,7 @@ class Frame:
                 size.
         """
         path = self._depth_path()
-        depth = depth_format(path).read(path, self.depth_span, self.depth_scale)
+        depth = depth_format(path).read(self._stored_depth(path))
         self._check_depth_size((depth.shape[0], depth.shape[1]))
         return depth
 
@@ -114,7 +117,7 @@ class Frame:
             UserError: as :meth:`read_depth`.
         """
         path = self._depth_path()
-        size = depth_format(path).size_of_whole_file(path, self.depth_span)
+        size = depth_format(path).size_of_whole_file(self._stored_depth(path))
         if size is None:
             self.read_depth()
         else:
@@ -146,6 +149,9 @@ class Frame:
             file = self.image_path.parent.parent / "depth" / f"{self.id}.png"
             raise UserError(f"frame {self.id} has no sensor depth", file, "add the file")
         return self.depth_path
+
+    def _stored_depth(self, path: Path) -> StoredDepth:
+        return StoredDepth(path, self.depth_span, self.depth_scale, self.depth_size)
 
     def _check_depth_size(self, size: tuple[int, int]) -> None:
         if self.depth_size not in (None, size):

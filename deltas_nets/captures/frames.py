@@ -26,6 +26,7 @@ class Camera(NamedTuple):
     depth_size: tuple[int, int] | None
     lens: Lens | None
     depth_scale: float = MILLIMETRES
+    cam_from_depth: FloatArray | None = None
 
 
 class FrameArrays(NamedTuple):
@@ -90,6 +91,7 @@ class Frames(Mapping[str, Frame]):
                 frame.depth_size,
                 frame.lens,
                 frame.depth_scale,
+                frame.cam_from_depth,
             )
             key = tuple(_hashable(part) for part in camera)
             if key not in cameras:
@@ -162,6 +164,7 @@ class Frames(Mapping[str, Frame]):
             depth_K=camera.depth_K,
             depth_size=camera.depth_size,
             depth_scale=camera.depth_scale,
+            cam_from_depth=camera.cam_from_depth,
             lens=camera.lens,
             image_span=_span(arrays.image_spans, position),
             depth_span=_span(arrays.depth_spans, position),

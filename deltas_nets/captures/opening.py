@@ -1,14 +1,17 @@
 """From a folder to a capture, whatever its layout."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.readers import scannet
 from deltas_nets.errors import UserError
 
-__all__ = ["READERS", "Reader", "open_capture"]
+__all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
 
 
 class Reader(Protocol):
@@ -18,13 +21,13 @@ class Reader(Protocol):
     """What a capture of this format is, in a few words after "a capture is"."""
 
     def recognises(self, path: Path) -> bool:
-        """Whether a folder looks like this format; it may be broken, which `read` explains."""
+        """Whether a folder or file looks like this format; it may be broken, as `read` explains."""
 
     def read(self, path: Path) -> Capture:
         """Read poses and intrinsics; no pixels are decoded.
 
         Frames that cannot be used are in ``lost``: training counts them, `open_capture` accepts
-        those without a pose and raises the others.
+        those without a pose or an image and raises the others.
 
         Raises:
             UserError: something that all frames need is missing or malformed; the text names it.
@@ -32,15 +35,24 @@ class Reader(Protocol):
         """
 
 
+@runtime_checkable
+class ReaderOfPoses(Protocol):
+    """What the reader of a format without intrinsics defines besides."""
+
+    def read_with(self, path: Path, intrinsics: Intrinsics | None) -> Capture:
+        """Read poses and images of a camera that the user states, as `Reader.read` does."""
+
+
 READERS: tuple[Reader, ...] = (scannet,)
 """The first that recognises a folder reads it."""
 
 
-def open_capture(path: str | Path) -> Capture:
+def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> Capture:
     """Read poses, intrinsics and sizes of a capture; no pixels are decoded.
 
     Args:
-        path: a folder in one of the layouts of `READERS`.
+        path: a folder in one of the layouts of `READERS`, or the file of one that is a file.
+        intrinsics: of all images, whatever the capture says; None for what it says.
 
     Returns:
         A capture with at least one frame.
@@ -52,24 +64,47 @@ def open_capture(path: str | Path) -> Capture:
     layouts = "a capture is " + "; or ".join(reader.LAYOUT for reader in READERS)
     if not path.exists():
         raise UserError("the capture does not exist", path, "check the path")
-    if not path.is_dir():
+    if not path.is_dir() and not path.is_file():
         raise UserError("the capture is not a folder", path, layouts)
     try:
         reader = next((reader for reader in READERS if reader.recognises(path)), None)
         if reader is None:
-            raise UserError("there is no capture in the folder", path, layouts)
-        return _usable(reader.read(path))
+            what = "there is no capture in the folder" if path.is_dir() else "this is no capture"
+            raise UserError(what, path, layouts)
+        return _usable(_read(reader, path, intrinsics))
     except OSError as error:
         what = f"the capture cannot be read ({error.strerror or error})"
         raise UserError(what, Path(error.filename or path), "check its permissions") from error
 
 
+def _read(reader: Reader, path: Path, intrinsics: Intrinsics | None) -> Capture:
+    if isinstance(reader, ReaderOfPoses):
+        return reader.read_with(path, intrinsics)
+    capture = reader.read(path)
+    if intrinsics is None:
+        return capture
+    frames = (
+        replace(frame, K=intrinsics.K, lens=intrinsics.lens) for frame in capture.frames.values()
+    )
+    return replace(capture, frames=Frames.of(frames, capture.frames.folder))
+
+
 def _usable(capture: Capture) -> Capture:
-    """The capture, unless a pose is wrong or none is there."""
+    """The capture, unless a pose is wrong or no frame is left."""
     for lost in capture.lost.values():
-        if lost.reason != "no pose":
+        if lost.reason not in ("no pose", "no image"):
             raise lost.error
+    if not capture.frames and not capture.lost:
+        raise UserError("the capture has no frame", capture.path, "add images and their poses")
     if not capture.frames:
+        without_image = [lost for lost in capture.lost.values() if lost.reason == "no image"]
+        if without_image:
+            error = without_image[0].error
+            raise UserError(
+                f"no frame has a pose and an image ({len(without_image)} images are missing)",
+                error.where,
+                error.remedy,
+            )
         what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(capture.lost)})"
         where = [Path(lost.error.where).parent for lost in capture.lost.values()]
         raise UserError(what, next(iter(where), capture.path), "run the tracking again")

@@ -20,7 +20,7 @@ from deltas_nets.outputs.atomic_files import write_atomically
 
 __all__ = ["read_scene_cached"]
 
-VERSION = 4
+VERSION = 5
 """Raised whenever the same files give another scene."""
 WORDS = ("ids", "images", "depths")
 
@@ -111,6 +111,7 @@ def _camera(
     depth_size: list[int] | None,
     lens: list[Any] | None,
     depth_scale: float,
+    cam_from_depth: list[list[float]] | None,
 ) -> Camera:
     return Camera(
         image_size=(image_size[0], image_size[1]),
@@ -119,6 +120,7 @@ def _camera(
         depth_size=None if depth_size is None else (depth_size[0], depth_size[1]),
         lens=None if lens is None else Lens(lens[0], tuple(lens[1])),
         depth_scale=depth_scale,
+        cam_from_depth=None if cam_from_depth is None else np.array(cam_from_depth),
     )
 
 

@@ -53,6 +53,8 @@ class _SceneFiles(NamedTuple):
 
 def recognises(path: Path) -> bool:
     """Whether this folder, or a folder of scenes inside it, is laid out this way."""
+    if not path.is_dir():
+        return False
     nested = any((path / name).is_dir() for name in NESTING)
     return nested or is_scene(path) or any(map(is_scene, path.iterdir()))
 
