@@ -8,7 +8,7 @@ from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.readers import scannet
+from deltas_nets.captures.readers import scannet, tum
 from deltas_nets.errors import UserError
 
 __all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
@@ -43,7 +43,10 @@ class ReaderOfPoses(Protocol):
         """Read poses and images of a camera that the user states, as `Reader.read` does."""
 
 
-READERS: tuple[Reader, ...] = (scannet,)
+READERS: tuple[Reader, ...] = (
+    scannet,
+    tum,
+)
 """The first that recognises a folder reads it."""
 
 

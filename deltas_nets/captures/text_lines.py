@@ -5,20 +5,41 @@ from pathlib import Path
 
 from deltas_nets.errors import UserError
 
+TEXT_LIMIT = 256 * 2**20
+"""Bytes. Two million lines of poses are less."""
 
-def read_lines(path: Path, *, name: str, remedy: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and words of the lines that are not empty; what follows a # is a comment.
+
+def read_text(path: Path, *, name: str, remedy: str) -> str:
+    """A text file within bounds.
+
+    Args:
+        path: the file.
+        name: what it holds, for errors.
+        remedy: what the user can do.
 
     Raises:
-        UserError: the file cannot be read, or is not text.
+        UserError: it cannot be read, is no file, is larger than `TEXT_LIMIT`, or is not text.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        size = path.stat().st_size
+        if size > TEXT_LIMIT or not path.is_file():
+            what = f"the {name} is no text file of less than {TEXT_LIMIT // 2**20} MiB"
+            raise UserError(what, path, remedy)
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         what = f"the {name} cannot be read ({error.strerror or error})"
         raise UserError(what, path, remedy) from error
     except UnicodeDecodeError as error:
         raise UserError(f"the {name} is not text", path, remedy) from error
+
+
+def read_lines(path: Path, *, name: str, remedy: str) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and words of the lines that are not empty; what follows a # is a comment.
+
+    Raises:
+        UserError: as `read_text`.
+    """
+    text = read_text(path, name=name, remedy=remedy)
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.partition("#")[0].split()
         if words:
@@ -36,10 +57,7 @@ def read_numbers(path: Path, *, name: str, remedy: str) -> list[float]:
     Raises:
         UserError: it is not text, or a word, which the error shows, is no number.
     """
-    try:
-        words = path.read_text(encoding="utf-8").split()
-    except UnicodeDecodeError as error:
-        raise UserError(f"the {name} file is not text", path, remedy) from error
+    words = read_text(path, name=f"{name} file", remedy=remedy).split()
     numbers = []
     for word in words:
         try:

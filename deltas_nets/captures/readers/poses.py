@@ -1,0 +1,84 @@
+"""Poses as files state them, and what is lost: what readers of many formats have in common."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.captures.capture import Lost
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.errors import UserError
+
+__all__ = ["OPENGL", "cam_from_world", "cam_from_world_of", "missing_images", "rigid"]
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+"""A camera whose y points up and which looks along -z, from one of ours, and back."""
+
+RIGID_TOLERANCE = 2e-3
+"""Largest entry of R^T R - I, as in ScanNet's reader."""
+
+
+def rigid(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """``(4, 4)`` from ``(3, 3)`` and ``(3,)``."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def cam_from_world(matrix: FloatArray, *, id: str, path: Path) -> FloatArray | Lost:
+    """A pose that a file states as world-to-camera, or why it is none.
+
+    Args:
+        matrix: ``(3 or 4, 4)``, rounded by printing as it may be.
+        id: of the frame, for errors.
+        path: the file it came from.
+
+    Returns:
+        ``(4, 4)``, read-only, whose rotation is orthogonal to float64 precision.
+    """
+    if not np.isfinite(matrix).all():
+        what = f"the pose of frame {id} is not finite"
+        remedy = "repair it or take the frame out of the view sets"
+        return Lost("no pose", UserError(what, path, remedy))
+    remedy = "write a rotation and a translation in one unit, without scale"
+    rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    if matrix.shape[0] == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        what = f"the last row of the pose of frame {id} is not 0 0 0 1"
+        return Lost("not rigid", UserError(what, path, remedy))
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not error <= RIGID_TOLERANCE:
+        what = f"the pose of frame {id} is not rigid: its rotation is off orthogonal by {error:.2g}"
+        return Lost("not rigid", UserError(what, path, remedy))
+    if np.linalg.det(rotation) < 0:
+        what = f"the pose of frame {id} mirrors: its rotation has determinant -1"
+        return Lost("not rigid", UserError(what, path, remedy))
+    left, _, right = np.linalg.svd(rotation)
+    pose = rigid(left @ right, translation)
+    pose.setflags(write=False)
+    return pose
+
+
+def cam_from_world_of(world_from_cam: FloatArray, *, id: str, path: Path) -> FloatArray | Lost:
+    """A pose that a file states as camera-to-world; see `cam_from_world`."""
+    pose = cam_from_world(world_from_cam, id=id, path=path)
+    if isinstance(pose, Lost):
+        return pose
+    inverse = rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
+    inverse.setflags(write=False)
+    return inverse
+
+
+def missing_images(ids: Sequence[str], path: Path) -> dict[str, Lost]:
+    """Frames whose images are not there, all with one error.
+
+    Args:
+        ids: of the frames.
+        path: the file that names them, or the folder where they should be.
+    """
+    if not ids:
+        return {}
+    what = f"there is no image of {len(ids)} of the frames ({ids_in_words(ids)})"
+    error = UserError(what, path, "put the images beside it, or leave those frames out")
+    return dict.fromkeys(ids, Lost("no image", error))

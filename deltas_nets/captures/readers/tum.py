@@ -1,0 +1,274 @@
+"""TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, each line with a time stamp of its own."""
+
+import os
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deltas_nets.captures.camera_words import Intrinsics, named_camera
+from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.images import image_size_of, in_words
+from deltas_nets.captures.readers.names import frame_ids, without_common_folder
+from deltas_nets.captures.readers.poses import cam_from_world_of, rigid
+from deltas_nets.captures.rotations import rotations_of
+from deltas_nets.captures.text_lines import read_text
+from deltas_nets.errors import UserError
+
+__all__ = ["LAYOUT", "read", "read_with", "recognises"]
+
+LAYOUT = "rgb.txt and groundtruth.txt (TUM RGB-D)"
+STEPS = 5000.0
+"""Steps of depth in a metre."""
+APART = 0.02
+"""Seconds between an image and its depth at most, as in the data set's own associate.py."""
+GAP = 0.1
+"""Seconds between two poses over which a camera moves evenly enough to interpolate."""
+SAME = 0.002
+"""Seconds from a pose that need no interpolation: 2 mm at 1 m/s."""
+KNOWN_SIZE = 480, 640
+
+_LIST_REMEDY = "write a time stamp and a file's name on each line"
+_POSE_REMEDY = "write timestamp tx ty tz qx qy qz qw (camera-to-world) on each line"
+
+
+class _Listed(NamedTuple):
+    """Files in the order of their stamps.
+
+    Attributes:
+        stamps: ``(F,)`` seconds.
+        names: of files that are there, from the capture's folder.
+        missing: how many are listed but not there.
+    """
+
+    stamps: FloatArray
+    names: Sequence[str]
+    missing: int
+
+
+class _Trajectory(NamedTuple):
+    """Poses in the order of their stamps: ``(P,)``, ``(P, 3)``, ``(P, 4)`` with w first."""
+
+    stamps: FloatArray
+    centres: FloatArray
+    quaternions: FloatArray
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has the two lists."""
+    return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
+
+
+def read(path: Path) -> Capture:
+    """Read a folder whose name, lists or intrinsics.txt say which camera it is."""
+    return read_with(path, None)
+
+
+def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
+    """Read a folder; see `deltas_nets.captures.opening.Reader` for the contract."""
+    images = _read_list(path / "rgb.txt")
+    depths = _Listed(np.zeros(0), (), 0)
+    if (path / "depth.txt").is_file():
+        depths = _read_list(path / "depth.txt")
+    if not images.names:
+        what = f"none of the {images.missing} images of the list is there"
+        raise UserError(what, path / "rgb.txt", "put them into the folder rgb")
+    sizes = (image_size_of(path / name) for name in images.names)
+    image_size = next((size for size in sizes if size is not None), None)
+    if image_size is None:
+        raise UserError("no image can be decoded", path / images.names[0], "copy the files again")
+    camera, said = _camera(path, image_size) if intrinsics is None else (intrinsics, "")
+    poses = _poses_at(images.stamps, _read_trajectory(path / "groundtruth.txt"))
+    nearest = _nearest(images.stamps, depths.stamps)
+    frames, lost, late = [], {}, 0
+    ids = frame_ids(without_common_folder(images.names), path / "rgb.txt")
+    for place, (id, name) in enumerate(zip(ids, images.names, strict=True)):
+        pose = _pose(poses[place], id, images.stamps[place], path / "groundtruth.txt")
+        if isinstance(pose, Lost):
+            lost[id] = pose
+            continue
+        depth = None if nearest[place] < 0 else path / depths.names[nearest[place]]
+        late += depth is None
+        frames.append(
+            Frame(
+                id=id,
+                image_path=path / name,
+                image_size=image_size,
+                K=camera.K,
+                lens=camera.lens,
+                cam_from_world=pose,
+                depth_path=depth,
+                depth_scale=STEPS,
+            )
+        )
+    doubts = []
+    if images.missing:
+        what = f"{images.missing} of {images.missing + len(images.names)} images listed"
+        doubts.append(f"{what} are not there and are left out, {path / 'rgb.txt'}")
+    if late and depths.names:
+        what = f"{late} images have no depth within {APART} s of their time stamp"
+        doubts.append(f"{what}, {path / 'depth.txt'}")
+    return Capture(
+        path, Frames.of(frames, path), lost, tuple(doubts), f"TUM RGB-D{said}", metric=True
+    )
+
+
+def _camera(path: Path, image_size: tuple[int, int]) -> tuple[Intrinsics, str]:
+    """The camera of a folder that states it, and a word on where from."""
+    for name in ("intrinsics.txt", "camera.txt"):
+        if (path / name).is_file():
+            remedy = "write fx fy cx cy, and k1 k2 p1 p2 k3 of a lens, or pass --intrinsics"
+            text = read_text(path / name, name="intrinsics", remedy=remedy)
+            lines = (line.partition("#")[0] for line in text.splitlines())
+            return Intrinsics.parse(" ".join(lines), path / name), f", {name}"
+    heads = (_head(path / name) for name in ("rgb.txt", "groundtruth.txt"))
+    for words in (path.resolve().name, *heads):
+        camera = named_camera(words)
+        if camera is None:
+            continue
+        if image_size != KNOWN_SIZE:
+            what = f"images are {in_words(image_size)}, those of TUM's cameras 640x480"
+            raise UserError(what, path, "pass --intrinsics 'fx fy cx cy' for this size")
+        return camera, ", a known camera"
+    what = "nothing says which camera this is: TUM RGB-D has no intrinsics"
+    remedy = "pass --intrinsics freiburg1 (or 2, 3) or --intrinsics 'fx fy cx cy k1 k2 p1 p2 k3'"
+    raise UserError(what, path, remedy)
+
+
+def _head(path: Path) -> str:
+    """The comments above a list, which name the recording."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return " ".join(line[:200] for line in islice(file, 3) if line.startswith("#"))
+
+
+def _read_list(path: Path) -> _Listed:
+    stamps, names, missing = [], [], 0
+    known: dict[str, frozenset[str]] = {}
+    for number, words in _lines(path, "list of images"):
+        if len(words) < 2:
+            raise UserError(f"line {number} has no name of a file", path, _LIST_REMEDY)
+        stamp = _number(words[0], number, path, _LIST_REMEDY)
+        # A name may hold spaces; four words are two lists joined by associate.py.
+        name = words[1] if len(words) == 4 else " ".join(words[1:])
+        if _is_there(path.parent, name, known):
+            stamps.append(stamp)
+            names.append(name)
+        else:
+            missing += 1
+    order = np.argsort(stamps, kind="stable")
+    return _Listed(np.array(stamps)[order], [names[place] for place in order], missing)
+
+
+def _is_there(folder: Path, name: str, known: dict[str, frozenset[str]]) -> bool:
+    """Whether a folder below holds a file; each folder is listed once."""
+    above, _, file = name.rpartition("/")
+    if above not in known:
+        parts = above.split("/")
+        inside = ".." not in parts and not name.startswith("/") and "\0" not in name
+        try:
+            known[above] = frozenset(os.listdir(folder / above) if inside else ())
+        except OSError:
+            known[above] = frozenset()
+    return file in known[above]
+
+
+def _read_trajectory(path: Path) -> _Trajectory:
+    rows = []
+    for number, words in _lines(path, "list of poses"):
+        if len(words) != 8:
+            what = f"line {number} has {len(words)} numbers, not 8"
+            raise UserError(what, path, _POSE_REMEDY)
+        stamp = _number(words[0], number, path, _POSE_REMEDY)
+        rows.append((stamp, *_numbers(words[1:], number, path)))
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    if not len(table):
+        raise UserError("the list of poses is empty", path, _POSE_REMEDY)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return _Trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])
+
+
+def _lines(path: Path, name: str) -> list[tuple[int, list[str]]]:
+    text = read_text(path, name=name, remedy=_LIST_REMEDY)
+    split = (
+        (number, line.partition("#")[0].replace(",", " ").split())
+        for number, line in enumerate(text.splitlines(), start=1)
+    )
+    return [(number, words) for number, words in split if words]
+
+
+def _number(word: str, line: int, path: Path, remedy: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise UserError(f"line {line} begins with {word[:20]!r}, no time stamp", path, remedy)
+    return value
+
+
+def _numbers(words: Sequence[str], line: int, path: Path) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        what = f"line {line} holds {' '.join(words)[:40]!r} where numbers should be"
+        raise UserError(what, path, _POSE_REMEDY) from error
+
+
+def _poses_at(stamps: FloatArray, known: _Trajectory) -> FloatArray:
+    """``(F, 4, 4)`` world_from_cam between the poses before and after; NaN where none are near."""
+    last = len(known.stamps) - 1
+    after = np.searchsorted(known.stamps, stamps).clip(0, last)
+    before = (after - 1).clip(0, last)
+    gap = known.stamps[after] - known.stamps[before]
+    part = (stamps - known.stamps[before]) / np.where(gap > 0, gap, 1)
+    within = (gap <= GAP) & (part >= 0) & (part <= 1)
+    # Poses of key frames alone are far apart, but at the stamps of their images.
+    nearer = np.where(np.abs(stamps - known.stamps[after]) < np.abs(part * gap), after, before)
+    at_one = np.abs(stamps - known.stamps[nearer]) <= SAME
+    part = np.where(within, part, (nearer == after) & (after > before))
+    part = np.where(within | at_one, part, np.nan)[:, None]
+    centres = (1 - part) * known.centres[before] + part * known.centres[after]
+    turns = _slerp(known.quaternions[before], known.quaternions[after], part)
+    return np.stack(
+        [rigid(R, t) for R, t in zip(rotations_of(turns), centres, strict=True)]
+    ).reshape(-1, 4, 4)
+
+
+def _slerp(first: FloatArray, last: FloatArray, part: FloatArray) -> FloatArray:
+    with np.errstate(all="ignore"):
+        first = first / np.linalg.norm(first, axis=1, keepdims=True)
+        last = last / np.linalg.norm(last, axis=1, keepdims=True)
+        cosine = (first * last).sum(axis=1, keepdims=True)
+        last, cosine = np.where(cosine < 0, -last, last), np.abs(cosine).clip(0, 1)
+        angle = np.arccos(cosine)
+        # Where the sine has no digits left, the chord is the arc.
+        near = angle < 1e-6
+        sine = np.where(near, 1, np.sin(angle))
+        a = np.where(near, 1 - part, np.sin((1 - part) * angle) / sine)
+        b = np.where(near, part, np.sin(part * angle) / sine)
+    return a * first + b * last
+
+
+def _pose(world_from_cam: FloatArray, id: str, stamp: float, path: Path) -> FloatArray | Lost:
+    if not np.isfinite(world_from_cam).all():
+        what = f"there is no pose at the time {stamp:.6f} of frame {id}"
+        remedy = f"add poses no more than {GAP} s apart, or take the frame out of the view sets"
+        return Lost("no pose", UserError(what, path, remedy))
+    return cam_from_world_of(world_from_cam, id=id, path=path)
+
+
+def _nearest(stamps: FloatArray, others: FloatArray) -> NDArray[np.int64]:
+    """The position of the nearest of other stamps, in order; -1 where none is within `APART`."""
+    if not len(others):
+        return np.full(len(stamps), -1)
+    after = np.searchsorted(others, stamps).clip(0, len(others) - 1)
+    before = (after - 1).clip(0)
+    nearer = np.where(
+        np.abs(others[after] - stamps) < np.abs(others[before] - stamps), after, before
+    )
+    return np.where(np.abs(others[nearer] - stamps) <= APART, nearer, -1)
