@@ -8,7 +8,7 @@ from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.readers import scannet, tum
+from deltas_nets.captures.readers import colmap, scannet, tum
 from deltas_nets.errors import UserError
 
 __all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
@@ -44,6 +44,7 @@ class ReaderOfPoses(Protocol):
 
 
 READERS: tuple[Reader, ...] = (
+    colmap,
     scannet,
     tum,
 )
