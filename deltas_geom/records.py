@@ -77,13 +77,17 @@ class Record(tuple[Any, ...], metaclass=_RecordType):
         return " ".join([_described(self), *sorted(kinds), *sorted(places)])
 
 
-def mapped(function: Callable[[Tensor], Any], value: Any) -> Any:
-    """The same nest of tuples with ``function`` of each tensor."""
+def mapped(function: Callable[[Tensor], Any], value: Any, but: str | None = None) -> Any:
+    """The same nest of tuples with ``function`` of each tensor, but of fields of this name."""
     if isinstance(value, Tensor):
         return function(value)
     if isinstance(value, tuple):
-        inside = [mapped(function, part) for part in value]
-        return type(value)(*inside) if hasattr(value, "_fields") else tuple(inside)
+        names = getattr(value, "_fields", None)
+        inside = [
+            part if name is not None and name == but else mapped(function, part, but)
+            for name, part in zip(names or [None] * len(value), value, strict=True)
+        ]
+        return type(value)(*inside) if names else tuple(inside)
     return value
 
 

@@ -102,7 +102,8 @@ def without_autocast(operation: Callable[_Arguments, _Result]) -> Callable[_Argu
     ``torch.autocast`` is kept out: it multiplies matrices in half precision. In bfloat16 a pixel
     at 600 is known to 4 px, and triangulation by cameras so rounded takes good points as at
     infinity. Results are in the dtype to which the arguments promote; where that is of half
-    precision they are rounded to it, and numbers beyond its range to the largest of it.
+    precision they are rounded to it, and numbers beyond its range to the largest of it. A record's
+    ``covariance`` stays in float32: rounded entry by entry it may be no covariance.
     """
     return _called(operation, rounds=True)
 
@@ -132,7 +133,7 @@ def _called(
         kinds = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]
         dtype = reduce(torch.promote_types, kinds)
         half = rounds and dtype in _HALF
-        return mapped(partial(_rounded, dtype=dtype), result) if half else result
+        return mapped(partial(_rounded, dtype=dtype), result, "covariance") if half else result
 
     return called
 

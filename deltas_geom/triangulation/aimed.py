@@ -13,7 +13,12 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import with_one
 from deltas_geom.checks import check_floating, check_positive, check_shapes
-from deltas_geom.numerics.arithmetic import finite_or_zero, promoted, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    at_least_in_single,
+    finite_or_zero,
+    promoted,
+    without_autocast,
+)
 from deltas_geom.triangulation.bearings import (
     Bearings,
     angles_of,
@@ -166,7 +171,7 @@ def refine_rays(
     return Refined(place, residual.to(points.dtype), valid)
 
 
-@without_autocast
+@at_least_in_single
 def ray_covariance(
     cam_from_world: Tensor,
     points: Tensor,
@@ -185,7 +190,7 @@ def ray_covariance(
         pose_covariance: ``(*B, V, 6, 6)`` of centres (m) and rotation vectors (rad).
 
     Returns:
-        ``(*B, N, 3, 3)`` m^2; all else is as there.
+        ``(*B, N, 3, 3)`` m^2, in float32 at least; all else is as there.
 
     Raises:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.

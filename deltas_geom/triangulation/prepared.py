@@ -1,6 +1,8 @@
 """Triangulation by cameras that stay, frame after frame."""
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -9,6 +11,8 @@ from deltas_geom.numerics.arithmetic import at_least_single, without_autocast
 from deltas_geom.triangulation.equations import Frame
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
+
+_Found = TypeVar("_Found")
 
 
 class PreparedTriangulator:
@@ -40,14 +44,15 @@ class PreparedTriangulator:
         covariance: bool = False,
         max_residual: float | None = None,
     ) -> None:
-        self.proj = at_least_single(proj)
+        self.proj = proj
         self.frame: Frame = frame
         self.covariance = covariance
         self.max_residual = max_residual
         self._renew()
 
     def _renew(self) -> None:
-        self._cameras, self._version = KnownCameras(self.proj), _version_of(self.proj)
+        self._cameras = KnownCameras(at_least_single(self.proj))
+        self._version = _version_of(self.proj)
 
     def _known(self) -> KnownCameras:
         version = _version_of(self.proj)
@@ -55,20 +60,18 @@ class PreparedTriangulator:
             self._renew()
         return self._cameras
 
-    @without_autocast
     def points(
         self, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
         """Points ``(*B, N, 3)`` alone, as :func:`triangulate_points`."""
-        return Call(self._known(), pixels, weights, mask, self.frame).points()
+        return _of_call(Call.points, self._known(), self.proj, pixels, weights, mask, self.frame)
 
-    @without_autocast
     def full(
         self, pixels: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
     ) -> Triangulation:
         """Points with status and all that is known about them, as :func:`triangulate`."""
-        call = Call(self._known(), pixels, weights, mask, self.frame)
-        found = call.full(covariance=self.covariance)
+        full = partial(Call.full, covariance=self.covariance)
+        found = _of_call(full, self._known(), self.proj, pixels, weights, mask, self.frame)
         return found if self.max_residual is None else found.within_residual(self.max_residual)
 
     def to(self, *args: Any, **kwargs: Any) -> "PreparedTriangulator":
@@ -79,6 +82,14 @@ class PreparedTriangulator:
             covariance=self.covariance,
             max_residual=self.max_residual,
         )
+
+
+@without_autocast
+def _of_call(
+    compute: Callable[[Call], _Found], known: KnownCameras, _: Tensor, *seen: Any
+) -> _Found:
+    """What is computed of a call, in the dtype of the cameras as they were given."""
+    return compute(Call(known, *seen))
 
 
 def _version_of(tensor: Tensor) -> int | None:

@@ -164,7 +164,7 @@ def point_covariance(
     return representable(found, proj.dtype)
 
 
-@without_autocast
+@at_least_in_single
 def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
     """Variance ``(*B, V, N)`` m^2 of points' depths in views, from the points' covariance.
 
@@ -173,8 +173,8 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         covariance: ``(*B, N, 3, 3)`` m^2 in the world.
 
     Returns:
-        In the dtype to which the arguments promote, whose largest number stands for more. 0
-        where the camera or the covariance is not finite.
+        In the dtype to which the arguments promote, float32 at least, whose largest number stands
+        for more. 0 where the camera or the covariance is not finite.
 
     Raises:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.

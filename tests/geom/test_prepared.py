@@ -61,6 +61,19 @@ def test_cameras_made_in_inference_mode_are_noticed_too(inputs: Inputs) -> None:
         assert torch.equal(rig.points(pixels, weights), triangulate_points(proj, pixels, weights))
 
 
+@pytest.mark.parametrize("kinds", [(0, 1), (1, 0), (1, 1)], ids=str)
+def test_dtypes_are_those_of_one_call(kinds: tuple[int, int]) -> None:
+    scene, dtypes = ring(), (torch.float32, torch.bfloat16)
+    proj, pixels = scene.views.proj.to(dtypes[kinds[0]]), scene.pixels.to(dtypes[kinds[1]])
+    rig = Triangulator(covariance=True).prepare(proj)
+    assert torch.equal(rig.points(pixels), triangulate_points(proj, pixels))
+    for ours, theirs in zip(
+        rig.full(pixels), triangulate(proj, pixels, covariance=True), strict=True
+    ):
+        assert ours is not None and theirs is not None
+        assert ours.dtype == theirs.dtype and torch.equal(ours, theirs)
+
+
 def test_it_moves(inputs: Inputs) -> None:
     rig = PreparedTriangulator(inputs[0], frame="world", max_residual=3.0).to(torch.float64)
     double = tuple(tensor.double() for tensor in inputs)

@@ -27,6 +27,7 @@ from deltas_geom.testing import PosedScene, default_intrinsics, forward_motion, 
 from deltas_geom.testing.strategies import extreme, posed_scenes, scales, vectors
 
 TRIALS = 4000
+NEAR = 1e-11  # of the largest: rounding, by a condition of 2e4, in whatever order is summed
 
 
 @st.composite
@@ -228,7 +229,7 @@ def test_an_unused_view_tells_nothing(drawn: tuple[PosedScene, Tensor], view: in
         scene.views.proj[rest], scene.points, weights[rest], pose_covariance=noise[rest]
     )
     size = float(wanted.abs().max())
-    assert_close(found, wanted, rtol=0, atol=1e-12 * size)
+    assert_close(found, wanted, rtol=0, atol=NEAR * size)
 
 
 WRONG = (torch.nan, torch.inf, -torch.inf, 1e200)
@@ -267,7 +268,7 @@ def test_an_unused_view_may_hold_anything(
         ray_parallax(*sound, mask[rest]),
     )
     for ours, theirs in zip(found, wanted, strict=True):
-        assert_close(ours, theirs, rtol=0, atol=1e-11 * max(1.0, float(theirs.abs().max())))
+        assert_close(ours, theirs, rtol=0, atol=NEAR * max(1.0, float(theirs.abs().max())))
     total = sum(value.sum() for value in found[:3])
     assert isinstance(total, Tensor)
     for gradient, tensor in zip(torch.autograd.grad(total, inputs), inputs, strict=True):
@@ -531,14 +532,6 @@ def test_fewer_than_two_views_state_nothing_and_one_line_states_a_large_variance
     assert (depth > 1e6).all()  # m^2
     behind = torch.tensor([[0.0, 0.0, -3.0]]).double()
     assert (point_covariance(proj, behind, torch.ones(3, 1).double()) == 0).all()
-
-
-def test_covariances_of_half_precision_are_single() -> None:
-    scene = three_views()
-    half = [tensor.half() for tensor in (scene.views.proj, scene.points, torch.ones(3, 2) / 300)]
-    found = point_covariance(*half)
-    assert found.dtype == torch.float32
-    assert torch.equal(found, point_covariance(*(tensor.float() for tensor in half)))
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
