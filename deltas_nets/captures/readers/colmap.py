@@ -7,19 +7,24 @@ the same in another way.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapModel, k_and_lens
-from deltas_nets.captures.frame import FloatArray, Lens
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.images import image_size_of, in_words
+from deltas_nets.captures.images import in_words
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.colmap_folder import find_models, has_model, is_binary, read_model
 from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.image_sizes import (
+    SizedCamera,
+    at_size,
+    doubts_of_sizes,
+    first_size,
+)
 from deltas_nets.captures.readers.names import frame_ids, without_common_folder
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
@@ -31,20 +36,6 @@ IMAGE_FOLDERS = ("images", "input")
 """Where programs that use COLMAP look for images: beside the model, or a folder or two above."""
 LARGEST_SIZE = 2**20
 """Pixels of a side."""
-
-
-class _Camera(NamedTuple):
-    """A camera at the size of its image files.
-
-    Attributes:
-        image_size: (height, width).
-        scale: ``(2,)`` right and down, from the camera as stated.
-    """
-
-    image_size: tuple[int, int]
-    K: FloatArray
-    lens: Lens | None
-    scale: FloatArray
 
 
 def recognises(path: Path) -> bool:
@@ -96,7 +87,7 @@ def capture_of_model(
     """
     file = _file(folder, "images")
     ids = _ids(model.images.names, file)
-    cameras, doubts = _cameras(model, images, folder)
+    cameras = _cameras(model, images, folder)
     rotations = rotations_of(model.images.quaternions)
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
@@ -128,7 +119,7 @@ def capture_of_model(
         path=path,
         frames=packed,
         lost=lost,
-        doubts=tuple(doubts),
+        doubts=tuple(doubts_of_sizes(cameras.values())),
         layout=f"COLMAP {'binary' if is_binary(folder) else 'text'}",
         metric=False,
         points=_points(model, packed, frame_of_image, scales),
@@ -153,12 +144,9 @@ def _ids(names: Sequence[str], file: Path) -> list[str]:
 
 def _cameras(
     model: ColmapModel, images: Sequence[Path | None], folder: Path
-) -> tuple[dict[int, _Camera], list[str]]:
-    """Cameras that took an image, at the size of its file, and what is to be said of them.
-
-    The first readable image of a camera stands for all: each is compared when it is read.
-    """
-    file, doubts = _file(folder, "cameras"), []
+) -> dict[int, SizedCamera]:
+    """Cameras that took an image, at the size of its file."""
+    file = _file(folder, "cameras")
     files: dict[int, list[Path]] = {int(id): [] for id in model.images.camera_ids}
     for id, image in zip(model.images.camera_ids.tolist(), images, strict=True):
         if image is not None:
@@ -169,17 +157,10 @@ def _cameras(
             what = f"images are of camera {id}, which is missing"
             raise UserError(what, file, "export the model from COLMAP again")
         stated = _checked(model.cameras[id], id, file)
-        sizes = ((image, image_size_of(image)) for image in taken)
-        image, size = next(((image, size) for image, size in sizes if size), (file, None))
-        cameras[id] = _at_size(stated, size or stated.image_size, image)
-        if size not in (None, stated.image_size):
-            doubts.append(
-                f"images are {in_words(cameras[id].image_size)}, the camera of the model is "
-                f"{in_words(stated.image_size)}, {image}: its intrinsics are scaled"
-            )
-    return cameras, doubts[:1] + [f"so are those of {len(doubts) - 1} more cameras"][
-        : len(doubts) - 1
-    ]
+        image, size = first_size(taken) or (file, stated.image_size)
+        K, lens = k_and_lens(stated)
+        cameras[id] = at_size(K, lens, stated=stated.image_size, size=size, image=image)
+    return cameras
 
 
 def _checked(camera: ColmapCamera, id: int, file: Path) -> ColmapCamera:
@@ -192,25 +173,6 @@ def _checked(camera: ColmapCamera, id: int, file: Path) -> ColmapCamera:
         what = f"camera {id} has images of {in_words(camera.image_size)}"
         raise UserError(what, file, "write the size of its images in pixels")
     return camera
-
-
-def _at_size(stated: ColmapCamera, size: tuple[int, int], image: Path) -> _Camera:
-    """A camera for images of a size, which shows the same as the stated one."""
-    (height, width), (rows, columns) = stated.image_size, size
-    scale = np.array([columns / width, rows / height])
-    one = np.sqrt(scale[0] * scale[1])
-    # A resized image is rounded to whole pixels on each axis.
-    if abs(columns - one * width) > 1 or abs(rows - one * height) > 1:
-        what = f"the image is {in_words(size)}, its camera is for {in_words(stated.image_size)}"
-        turned = abs(columns * width - rows * height) < 0.01 * columns * width
-        remedy = "use the images that the model was made from"
-        raise UserError(what, image, "turn it as its EXIF says" if turned else remedy)
-    K, lens = k_and_lens(stated)
-    scaled = K.copy()
-    scaled[:2] *= scale[:, None]
-    scaled[:2, 2] += (scale - 1) / 2
-    scaled.setflags(write=False)
-    return _Camera(size, scaled, lens, scale)
 
 
 def _points(
