@@ -109,6 +109,17 @@ class Fields:
             )
         return found
 
+    def truth(self, key: str) -> bool:
+        """Whether something is true; not where it is not there.
+
+        Raises:
+            UserError: there is something else.
+        """
+        found = self.values.get(key)
+        if not isinstance(found, bool | None):
+            raise self.error(f"has a {key} that is neither true nor false")
+        return bool(found)
+
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number.
 
