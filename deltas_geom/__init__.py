@@ -5,6 +5,12 @@ Conventions: OpenCV axes, ``cam_from_world``, pixel centres at integers, metres.
 """
 
 from deltas_geom.cameras.homogeneous import from_homogeneous, to_homogeneous
+from deltas_geom.cameras.lenses.lens import Lens, LensPixels, LensRays
+from deltas_geom.cameras.lenses.undistort import (
+    UndistortedImage,
+    undistort_image,
+    undistort_pixels,
+)
 from deltas_geom.cameras.pixels import (
     crop_intrinsics,
     in_image,
@@ -56,6 +62,9 @@ from deltas_geom.triangulation.uncertainty import (
 __all__ = [
     "DepthRasterizer",
     "EpipolarSampler",
+    "Lens",
+    "LensPixels",
+    "LensRays",
     "Matches",
     "PosedViews",
     "PreparedTriangulator",
@@ -72,6 +81,7 @@ __all__ = [
     "Triangulation",
     "Triangulator",
     "TwoViewTriangulation",
+    "UndistortedImage",
     "camera_centers",
     "correlate",
     "correlate_normalized",
@@ -116,6 +126,8 @@ __all__ = [
     "triangulate_robust_rays",
     "triangulate_tracks",
     "triangulate_two_view",
+    "undistort_image",
+    "undistort_pixels",
     "unproject",
     "weights_from_covariance",
 ]

@@ -29,7 +29,7 @@ def inputs_in(dtype: torch.dtype, num: int = 6) -> Inputs:
 
     views, pixels, points = scene.views, scene.pixels[:, :num], scene.points[:num]
     segments = geom.epipolar_segments(views, pixels[0], depth_range=RANGE, image_size=SIZE)
-    square = drawn(num, 3, 3)
+    square, maps = drawn(num, 3, 3), drawn(2, 5, 12, 16)
     found: Inputs = {
         "K": views.K,
         "poses": views.cam_from_world,
@@ -49,9 +49,14 @@ def inputs_in(dtype: torch.dtype, num: int = 6) -> Inputs:
         "homogeneous": geom.to_homogeneous(pixels[0]),
         "covariance": square @ square.mT + torch.eye(3),
         "spread": square[:, :2, :2] @ square[:, :2, :2].mT + torch.eye(2),
+        "own_points": torch.cat([0.3 * drawn(num, 2) - 0.1, 0.8 + drawn(num, 1)], dim=-1),
+        "coefficients": torch.tensor([-0.1, 0.02, 1e-3, -2e-3]),
+        "one_K": views.K[0],
+        "small_K": torch.tensor([[9.0, 0.2, 8.0], [0, 10, 5.5], [0, 0, 1]]),
         "pose_spread": 1e-6 * torch.eye(6).expand(3, 6, 6),
         "descriptors": drawn(num, 5),
-        "maps": drawn(2, 5, 12, 16),
+        "maps": maps,
+        "image": maps[0],
         "scores": drawn(2, num, 3, 8),
         "logits": drawn(num, 8),
         "positions": drawn(num, 8, 2),
@@ -123,6 +128,10 @@ def refined(
     proj: Tensor, pixels: Tensor, points: Tensor, weights: Tensor, mask: Tensor, **options: Any
 ) -> geom.Refined:
     return geom.refine_points(proj, pixels, points, weights, mask, steps=2, **options)
+
+
+def through(K: Tensor, coefficients: Tensor) -> geom.Lens:
+    return geom.Lens(K, coefficients, "OPENCV")
 
 
 def rasterized(
@@ -230,6 +239,15 @@ OPERATIONS: dict[str, Operation] = {
     "triangulate_two_view": lambda proj, pixels, mask: geom.triangulate_two_view(
         proj[..., :2, :, :], pixels[..., :2, :, :], mask[..., :2, :], covariance=True
     ),
+    "undistort_image": lambda small_K, coefficients, image: geom.undistort_image(
+        through(small_K, coefficients), image
+    ),
+    "undistort_image, K": lambda small_K, coefficients, image: geom.undistort_image(
+        through(small_K, coefficients), image, new_K=0.9 * small_K, new_size=(5, 6)
+    ),
+    "undistort_pixels": lambda one_K, coefficients, keypoints: geom.undistort_pixels(
+        through(one_K, coefficients), keypoints
+    ),
     "unproject": lambda K, poses, pixels, depth: geom.unproject(
         PosedViews(K, poses), pixels, depth
     ),
@@ -256,7 +274,18 @@ METHODS: dict[str, Operation] = {
     ),
 }
 
+METHODS |= {
+    "Lens.project": lambda one_K, coefficients, own_points: through(one_K, coefficients).project(
+        own_points
+    ),
+    "Lens.unproject": lambda one_K, coefficients, keypoints: through(one_K, coefficients).unproject(
+        keypoints
+    ),
+}
+
 RECORDS: dict[str, Operation] = {
+    "LensPixels": METHODS["Lens.project"],
+    "LensRays": METHODS["Lens.unproject"],
     "Matches": OPERATIONS["match_joint"],
     "PosedViews": lambda K, poses: PosedViews(K, poses),
     "Projection": OPERATIONS["project"],
@@ -277,6 +306,7 @@ RECORDS: dict[str, Operation] = {
     ),
     "Triangulation": OPERATIONS["triangulate"],
     "TwoViewTriangulation": OPERATIONS["triangulate_two_view"],
+    "UndistortedImage": OPERATIONS["undistort_image"],
 }
 
 

@@ -1,0 +1,1 @@
+"""Cameras whose images are not straight: models, projection, rays, images undistorted."""

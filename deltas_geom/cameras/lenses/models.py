@@ -1,0 +1,113 @@
+"""The table of camera models, by COLMAP's names: a new model is a row here, and its functions.
+
+Source: COLMAP's src/colmap/sensor/models.h states each model; OPENCV_THIN_PRISM is OpenCV's with
+twelve coefficients, for which COLMAP has no name.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom.cameras.lenses import closed
+from deltas_geom.cameras.lenses.closed import Coefficients, Direction, Seen
+from deltas_geom.cameras.lenses.polynomial import Polynomial, prism_of_aria
+
+
+class Model(NamedTuple):
+    """What a name stands for.
+
+    Attributes:
+        coefficients: their names, in COLMAP's order.
+        focals: how many focal lengths COLMAP writes before the principal point: 1 or 2.
+        pixels: from coefficients, the reach and a point: its place on the plane, and whether.
+        rays: from coefficients, the reach, a place on the plane and whether a gradient is wanted:
+            the unit ray, and whether.
+        reach: from coefficients, how far the model is one to one, ``(*B, R)``.
+    """
+
+    coefficients: tuple[str, ...]
+    focals: int
+    pixels: Callable[[Coefficients, Tensor, Tensor, Tensor, Tensor], Seen]
+    rays: Callable[[Coefficients, Tensor, Tensor, Tensor, bool], Direction]
+    reach: Callable[[Coefficients], Tensor] | None = None
+
+
+def _closed(
+    names: str,
+    focals: int,
+    pixels: Callable[[Coefficients, Tensor, Tensor, Tensor], Seen],
+    rays: Callable[[Coefficients, Tensor, Tensor], Direction],
+) -> Model:
+    def rays_of_length_one(
+        coefficients: Coefficients, _: Tensor, u: Tensor, v: Tensor, derivable: bool
+    ) -> Direction:
+        x, y, z, known = rays(coefficients, u, v)
+        inverse = torch.addcmul(torch.addcmul(x * x, y, y), z, z).rsqrt()
+        return x * inverse, y * inverse, z * inverse, known
+
+    return Model(
+        tuple(names.split()),
+        focals,
+        lambda coefficients, _, x, y, z: pixels(coefficients, x, y, z),
+        rays_of_length_one,
+    )
+
+
+def _polynomial(names: str, focals: int, kind: Polynomial) -> Model:
+    return Model(tuple(names.split()), focals, kind.pixels, kind.rays, kind.reach)
+
+
+def _slopes(names: str, focals: int = 2, /, **kinds: str) -> Model:
+    return _polynomial(names, focals, Polynomial.named(names, angles=False, **kinds))
+
+
+def _angles(names: str, focals: int = 2, /, **kinds: str) -> Model:
+    return _polynomial(names, focals, Polynomial.named(names, angles=True, **kinds))
+
+
+_RATIONAL = "k1 k2 p1 p2 k3 k4 k5 k6"
+_QUOTIENT = {"radial": "k1 k2 k3", "divided": "k4 k5 k6", "tangential": "p2 p1"}
+_TANGENTIAL = "p2 p1"  # the coefficient of 3 x^2 + y^2 comes second
+
+MODELS: dict[str, Model] = {
+    "SIMPLE_PINHOLE": _closed("", 1, closed.pinhole_pixels, closed.pinhole_rays),
+    "PINHOLE": _closed("", 2, closed.pinhole_pixels, closed.pinhole_rays),
+    "SIMPLE_RADIAL": _slopes("k", 1, radial="k"),
+    "RADIAL": _slopes("k1 k2", 1, radial="k1 k2"),
+    "OPENCV": _slopes("k1 k2 p1 p2", radial="k1 k2", tangential=_TANGENTIAL),
+    "FULL_OPENCV": _slopes(_RATIONAL, **_QUOTIENT),
+    "OPENCV_THIN_PRISM": _slopes(f"{_RATIONAL} s1 s2 s3 s4", prism="s1 s3 s2 s4", **_QUOTIENT),
+    "FOV": _closed("omega", 2, closed.fov_pixels, closed.fov_rays),
+    "SIMPLE_DIVISION": _closed("k", 1, closed.division_pixels, closed.division_rays),
+    "DIVISION": _closed("k", 2, closed.division_pixels, closed.division_rays),
+    "EUCM": _closed("alpha beta", 2, closed.eucm_pixels, closed.eucm_rays),
+    "SIMPLE_FISHEYE": _angles("", 1),
+    "FISHEYE": _angles(""),
+    "SIMPLE_RADIAL_FISHEYE": _angles("k", 1, radial="k"),
+    "RADIAL_FISHEYE": _angles("k1 k2", 1, radial="k1 k2"),
+    "OPENCV_FISHEYE": _angles("k1 k2 k3 k4", radial="k1 k2 k3 k4"),
+    "THIN_PRISM_FISHEYE": _angles(
+        "k1 k2 p1 p2 k3 k4 sx1 sy1",
+        radial="k1 k2 k3 k4",
+        tangential=_TANGENTIAL,
+        prism="sx1 sy1",
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Model(
+        ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+        2,
+        prism_of_aria.pixels,
+        prism_of_aria.rays,
+        prism_of_aria.reach,
+    ),
+    "EQUIRECTANGULAR": _closed("", 2, closed.panorama_pixels, closed.panorama_rays),
+}
+"""COLMAP writes width and height in place of the focal lengths of EQUIRECTANGULAR."""
+
+
+def names_like(name: str) -> Sequence[str]:
+    """The name of the table nearest to one that is not in it."""
+    import difflib
+
+    return difflib.get_close_matches(name.upper().replace("-", "_"), MODELS, n=1, cutoff=0.4)

@@ -1,0 +1,192 @@
+r"""Polynomial distortion of a plane: its terms, its derivative, and how far it is one to one.
+
+A point u of the plane, of slopes or of angles, goes to
+
+.. math:: u\,g(t) + p\,t + 2u\,(p \cdot u) + s_1 t + s_2 t^2, \quad t = |u|^2
+
+g being a polynomial or a quotient of two, p the tangential and s the thin prism's vectors.
+
+Source: Brown, Close-range camera calibration, 1971; OpenCV's calibration documentation.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+Pair = tuple[Tensor, Tensor]
+_FARTHEST = 1e6  # slope: beyond it is the camera's own plane
+
+
+class Terms(NamedTuple):
+    """Coefficients, each ``(*B, 1)``.
+
+    Attributes:
+        radial: of t, t^2, ... in the numerator of g.
+        divided: of t, t^2, ... in its denominator.
+        tangential: x and y of p, or nothing.
+        prism: x and y of s1, x and y of s2, or nothing.
+    """
+
+    radial: tuple[Tensor, ...] = ()
+    divided: tuple[Tensor, ...] = ()
+    tangential: tuple[Tensor, ...] = ()
+    prism: tuple[Tensor, ...] = ()
+
+    @property
+    def only_radial(self) -> bool:
+        """Are there no other terms than those of the gain?"""
+        return not self.tangential and not self.prism
+
+
+class Jacobian(NamedTuple):
+    """Of an image (u, v) by (x, y)."""
+
+    ux: Tensor
+    uy: Tensor
+    vx: Tensor
+    vy: Tensor
+
+
+def gain(terms: Terms, t: Tensor) -> Pair:
+    """g and its derivative by t."""
+    g, slope = _polynomial(terms.radial, t)
+    if not terms.divided:
+        return g, slope
+    below, below_slope = _polynomial(terms.divided, t)
+    g = g / below
+    return g, (slope - g * below_slope) / below
+
+
+def _polynomial(coefficients: Sequence[Tensor], t: Tensor) -> Pair:
+    """1 + c1 t + c2 t^2 + ... and its derivative, by Horner's scheme."""
+    if not coefficients:
+        return torch.ones_like(t), torch.zeros_like(t)
+    value, slope = coefficients[-1], None
+    for coefficient in [*coefficients[-2::-1], t.new_ones(())]:
+        slope = value if slope is None else torch.addcmul(value, slope, t)
+        value = torch.addcmul(coefficient, value, t)
+    return value, slope if slope is not None else torch.zeros_like(t)
+
+
+def distort(terms: Terms, x: Tensor, y: Tensor) -> Pair:
+    """Where a point of the plane goes."""
+    t = torch.addcmul(x * x, y, y)
+    g, _ = gain(terms, t)
+    return _moved(terms, x, y, t, g)
+
+
+def distort_and_derive(terms: Terms, x: Tensor, y: Tensor) -> tuple[Pair, Jacobian]:
+    """Where a point of the plane goes, and the derivative by the point."""
+    t = torch.addcmul(x * x, y, y)
+    g, slope = gain(terms, t)
+    place = _moved(terms, x, y, t, g)
+    twice_x, twice_y = 2 * x, 2 * y
+    by_x, by_y = slope * x, slope * y
+    if not terms.tangential:
+        ux, uy = torch.addcmul(g, twice_x, by_x), twice_x * by_y
+        jacobian = Jacobian(ux, uy, uy, torch.addcmul(g, twice_y, by_y))
+    else:
+        px, py = terms.tangential
+        along_x, along_y = px * twice_x, py * twice_y
+        g = g + along_x + along_y
+        ux = torch.addcmul(g + along_x, twice_x, by_x + px)
+        vy = torch.addcmul(g + along_y, twice_y, by_y + py)
+        uy = torch.addcmul(px * twice_y, twice_x, by_y + py)
+        jacobian = Jacobian(ux, uy, uy, vy)
+    if terms.prism:
+        sx1, sy1, sx2, sy2 = terms.prism
+        x_slope = torch.addcmul(sx1, sx2, 2 * t)
+        y_slope = torch.addcmul(sy1, sy2, 2 * t)
+        jacobian = Jacobian(
+            torch.addcmul(jacobian.ux, x_slope, twice_x),
+            torch.addcmul(jacobian.uy, x_slope, twice_y),
+            torch.addcmul(jacobian.vx, y_slope, twice_x),
+            torch.addcmul(jacobian.vy, y_slope, twice_y),
+        )
+    return place, jacobian
+
+
+def _moved(terms: Terms, x: Tensor, y: Tensor, t: Tensor, g: Tensor) -> Pair:
+    if terms.tangential:
+        px, py = terms.tangential
+        g = g + 2 * torch.addcmul(px * x, py, y)
+        u, v = torch.addcmul(px * t, x, g), torch.addcmul(py * t, y, g)
+    else:
+        u, v = x * g, y * g
+    if terms.prism:
+        sx1, sy1, sx2, sy2 = terms.prism
+        u = torch.addcmul(u, t, torch.addcmul(sx1, sx2, t))
+        v = torch.addcmul(v, t, torch.addcmul(sy1, sy2, t))
+    return u, v
+
+
+@torch.no_grad()
+def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
+    """The radius of the disc around the axis in which distortion is one to one, ``(*B, 1)``.
+
+    In it the symmetric part of the derivative is positive definite, and a map of a convex domain
+    of which this holds takes no value twice. Without other terms than radial ones it ends
+    exactly where r g(r^2) turns back, or has a pole; a tangential vector p takes 6 |p| r from the
+    derivative where it takes most, a prism 2 |s1| r + 4 |s2| r^3.
+
+    Args:
+        terms: of the distortion, all finite.
+        most: the radius where nothing turns back; pi for angles.
+    """
+    limit = min(most, _FARTHEST)
+    one = torch.ones_like(next(c for part in terms for c in part))
+    # Coefficients of powers of t, in a list; those of powers of r lie between.
+    above, below = [one, *terms.radial], [one, *terms.divided]
+    steepness = _product(above, below)
+    for i, a in enumerate(above):
+        for k, b in enumerate(below):
+            steepness[i + k] = steepness[i + k] + 2 * (i - k) * a * b
+    of_r = [part for each in steepness for part in (each, torch.zeros_like(one))][:-1]
+    if not terms.only_radial:
+        taken = [torch.zeros_like(one) for _ in range(4)]
+        if terms.tangential:
+            taken[1] = taken[1] - 6 * torch.hypot(*terms.tangential)
+        if terms.prism:
+            sx1, sy1, sx2, sy2 = terms.prism
+            taken[1] = taken[1] - 2 * torch.hypot(sx1, sy1)
+            taken[3] = taken[3] - 4 * torch.hypot(sx2, sy2)
+        squared = _product(below, below)
+        squared = [part for each in squared for part in (each, torch.zeros_like(one))][:-1]
+        of_r = _sum(of_r, _product(taken, squared))
+        first = _first_root(of_r[1:])
+    else:
+        first = _first_root(steepness[1:]).sqrt()
+    if terms.divided:
+        first = torch.minimum(first, _first_root(list(terms.divided)).sqrt())
+    return first.clamp(max=limit)
+
+
+def _product(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
+    found: list[Tensor] = [torch.zeros_like(a[0] * b[0]) for _ in range(len(a) + len(b) - 1)]
+    for i, first in enumerate(a):
+        for k, second in enumerate(b):
+            found[i + k] = torch.addcmul(found[i + k], first, second)
+    return found
+
+
+def _sum(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
+    longer, shorter = (a, b) if len(a) >= len(b) else (b, a)
+    return [x + shorter[k] if k < len(shorter) else x for k, x in enumerate(longer)]
+
+
+def _first_root(coefficients: Sequence[Tensor]) -> Tensor:
+    """The smallest positive root of 1 + c1 z + c2 z^2 + ..., infinite if there is none."""
+    if not coefficients:
+        raise ValueError("a polynomial of degree 0 has no roots")
+    c = torch.stack(list(coefficients), dim=-1)
+    size = c.shape[-1]
+    # The companion matrix of z^n times the polynomial of 1/z, whose leading coefficient is 1.
+    below = torch.eye(size, device=c.device, dtype=c.dtype)[:-1].expand(*c.shape[:-1], -1, -1)
+    inverse = torch.linalg.eigvals(torch.cat([-c.unsqueeze(-2), below], dim=-2))
+    # Two roots that are nearly one are a bit apart from the real line, by the root of rounding.
+    close = 64 * math.sqrt(torch.finfo(c.dtype).eps)
+    real = inverse.imag.abs() <= close * inverse.real
+    return torch.where(real, inverse.real, 0.0).amax(dim=-1).clamp(min=0).reciprocal()
