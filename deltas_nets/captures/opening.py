@@ -8,7 +8,19 @@ from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.readers import colmap, scannet, tum
+from deltas_nets.captures.readers import (
+    colmap,
+    kapture,
+    openmvg,
+    opensfm,
+    polycam,
+    record3d,
+    robustmvd,
+    scannet,
+    sevenscenes,
+    transforms,
+    tum,
+)
 from deltas_nets.errors import UserError
 
 __all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
@@ -45,8 +57,16 @@ class ReaderOfPoses(Protocol):
 
 READERS: tuple[Reader, ...] = (
     colmap,
+    transforms,
     scannet,
     tum,
+    record3d,
+    polycam,
+    sevenscenes,
+    robustmvd,
+    opensfm,
+    openmvg,
+    kapture,
 )
 """The first that recognises a folder reads it."""
 

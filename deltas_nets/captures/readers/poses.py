@@ -8,9 +8,17 @@ import numpy as np
 from deltas_nets.captures.capture import Lost
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
-__all__ = ["OPENGL", "cam_from_world", "cam_from_world_of", "missing_images", "rigid"]
+__all__ = [
+    "OPENGL",
+    "cam_from_world",
+    "cam_from_world_of",
+    "missing_images",
+    "rigid",
+    "rotation_of_vector",
+]
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 """A camera whose y points up and which looks along -z, from one of ours, and back."""
@@ -68,6 +76,17 @@ def cam_from_world_of(world_from_cam: FloatArray, *, id: str, path: Path) -> Flo
     inverse = rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
     inverse.setflags(write=False)
     return inverse
+
+
+def rotation_of_vector(vector: FloatArray) -> FloatArray:
+    """The rotation by a vector's length, in radians, about its direction: ``(3,)`` to ``(3, 3)``.
+
+    NaN where the vector is not finite.
+    """
+    with np.errstate(all="ignore"):
+        angle = np.sqrt((vector * vector).sum())
+        part = np.sin(angle / 2) / angle if angle > 1e-12 else 0.5
+        return rotations_of(np.array([np.cos(angle / 2), *(part * vector)]))
 
 
 def missing_images(ids: Sequence[str], path: Path) -> dict[str, Lost]:

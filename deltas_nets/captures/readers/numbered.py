@@ -1,0 +1,31 @@
+"""Files of a folder that are named by numbers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["numbered_files"]
+
+
+def numbered_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> dict[int, Path]:
+    """Files by number, in order; none where there is no folder.
+
+    Args:
+        folder: to list.
+        suffixes: in lower case, such as ``.color.png``, best first.
+        prefix: before the number.
+    """
+    if not folder.is_dir():
+        return {}
+    found: dict[int, tuple[int, Path]] = {}
+    for path in folder.iterdir():
+        name = path.name.lower()
+        suffix = next((suffix for suffix in suffixes if name.endswith(suffix)), None)
+        if suffix is None or not name.startswith(prefix):
+            continue
+        digits = name[len(prefix) : len(name) - len(suffix)]
+        if digits.isascii() and digits.isdigit() and len(digits) < 19:
+            better = suffixes.index(suffix)
+            number = int(digits)
+            if number not in found or better < found[number][0]:
+                found[number] = better, path
+    return {number: found[number][1] for number in sorted(found)}
