@@ -13,6 +13,7 @@ from deltas_nets.captures.readers import (
     kapture,
     openmvg,
     opensfm,
+    own,
     polycam,
     record3d,
     robustmvd,
@@ -56,6 +57,7 @@ class ReaderOfPoses(Protocol):
 
 
 READERS: tuple[Reader, ...] = (
+    own,
     colmap,
     transforms,
     scannet,

@@ -10,6 +10,7 @@ from deltas_nets.errors import UserError
 __all__ = [
     "DEPTH_SUFFIXES",
     "IMAGE_SUFFIXES",
+    "check_ids",
     "frame_ids",
     "name_parts",
     "without_common_folder",
@@ -84,6 +85,19 @@ def frame_ids(names: Sequence[str], path: Path) -> list[str]:
         often = Counter(ids)
         ids = [name if often[id] > 1 else id for id, name in zip(ids, whole, strict=True)]
     return ids
+
+
+def check_ids(ids: Sequence[str], path: Path) -> None:
+    """Refuse ids that a file states and that files of results cannot be called by.
+
+    Raises:
+        UserError: as `frame_ids`.
+    """
+    for id in ids:
+        _check_name(id, path)
+    if len(set(ids)) < len(ids):
+        twice = next(id for id, count in Counter(ids).items() if count > 1)
+        raise UserError(f"two frames have the id {_shown(twice)}", path, "give each its own")
 
 
 def _check_name(name: str, path: Path) -> None:
