@@ -7,6 +7,7 @@ import sys
 
 from deltas_nets.commands.calibrate import Calibrate
 from deltas_nets.commands.command_line import run
+from deltas_nets.commands.convert import Convert
 from deltas_nets.commands.cost import Cost
 from deltas_nets.commands.demo import Demo
 from deltas_nets.commands.depth import Depth
@@ -16,7 +17,7 @@ from deltas_nets.commands.export import Export
 from deltas_nets.commands.recipe import Recipe
 from deltas_nets.commands.train import Train
 
-COMMANDS = (Demo, Depth, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
+COMMANDS = (Demo, Depth, Convert, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
 
 
 def main() -> None:

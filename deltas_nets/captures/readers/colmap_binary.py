@@ -18,7 +18,7 @@ from deltas_nets.captures.colmap_model import (
 )
 from deltas_nets.errors import UserError
 
-__all__ = ["POINT", "TRACKED", "read_binary_model"]
+__all__ = ["CAMERA", "COUNT", "HEAD", "POINT", "TRACKED", "read_binary_model"]
 
 REMEDY = "copy the file again, or export the model from COLMAP again"
 
@@ -51,7 +51,7 @@ class _Bytes:
 
     def count(self, least: int) -> int:
         """How many things follow, of which each takes some bytes at least."""
-        count = int(self.take(_COUNT)[0])
+        count = int(self.take(COUNT)[0])
         if count * least > len(self.data) - self.place:
             left = len(self.data) - self.place
             what = f"the file is cut short or damaged: {count} entries in {left} bytes"
@@ -80,8 +80,8 @@ class _Bytes:
             raise UserError(what, self.path, REMEDY) from error
 
 
-_COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
+COUNT = struct.Struct("<Q")
+CAMERA = struct.Struct("<IiQQ")
 
 
 def read_binary_model(folder: Path) -> ColmapModel:
@@ -103,8 +103,8 @@ def read_binary_model(folder: Path) -> ColmapModel:
 
 def _read_cameras(file: _Bytes) -> dict[int, ColmapCamera]:
     cameras: dict[int, ColmapCamera] = {}
-    for _ in range(file.count(_CAMERA.size)):
-        id, model_id, width, height = map(int, file.take(_CAMERA))
+    for _ in range(file.count(CAMERA.size)):
+        id, model_id, width, height = map(int, file.take(CAMERA))
         name = model_of_id(model_id)
         if name is None:
             raise UserError(f"camera {id} is of an unknown model, {model_id}", file.path, REMEDY)
@@ -117,7 +117,7 @@ def _read_cameras(file: _Bytes) -> dict[int, ColmapCamera]:
 
 def _read_images(file: _Bytes) -> tuple[ColmapImages, ColmapTracks]:
     heads, names, tracks = [], [], []
-    for _ in range(file.count(HEAD.size + 1 + _COUNT.size)):
+    for _ in range(file.count(HEAD.size + 1 + COUNT.size)):
         heads.append(file.take(HEAD))
         names.append(file.text())
         count = file.count(TRACKED.itemsize)
@@ -149,7 +149,7 @@ def _starts_of_points(file: _Bytes, count: int) -> NDArray[np.int64]:
     """Where each point begins; tracks are of any length, and the images say the same."""
     starts = np.empty(count, dtype=np.int64)
     data, place, end = file.data, file.place, len(file.data)
-    unpack, ahead = _COUNT.unpack_from, POINT.itemsize - _COUNT.size
+    unpack, ahead = COUNT.unpack_from, POINT.itemsize - COUNT.size
     for index in range(count):
         starts[index] = place
         place += POINT.itemsize

@@ -1,0 +1,78 @@
+"""From a capture to a folder in another format, whole or not at all."""
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.writers import colmap, own, scannet, transforms
+from deltas_nets.captures.writers.files import Placing
+from deltas_nets.errors import UserError
+
+__all__ = ["WRITERS", "Writer", "save_capture"]
+
+Writer = Callable[[Capture, Path, Placing], list[str]]
+
+WRITERS: Mapping[str, Writer] = {
+    "own": own.write,
+    "scannet": scannet.write,
+    "colmap": colmap.write_text,
+    "colmap-bin": colmap.write_binary,
+    "transforms": transforms.write,
+}
+"""By the name of the format; see `deltas_nets.captures.writers` for what they do."""
+
+
+def save_capture(
+    capture: Capture, out: str | Path, to: str = "own", *, placing: Placing = "copy"
+) -> list[str]:
+    """Write a capture in another format.
+
+    It is written beside the folder under a temporary name, which the folder takes when it is whole.
+
+    Args:
+        capture: whose frames are written; those that are lost are not.
+        out: a folder that does not exist, or is empty.
+        to: one of `WRITERS`.
+        placing: whether images and depth are copied, or are links to where they are.
+
+    Returns:
+        What the format had no place for, in words.
+
+    Raises:
+        UserError: the format cannot hold the capture, a file is missing, or the folder cannot be
+            written; nothing is left behind.
+    """
+    out = Path(out)
+    if to not in WRITERS:
+        raise UserError(f"there is no format {to!r}", "--to", f"use {', '.join(WRITERS)}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        what = "the folder is not empty" if out.is_dir() else "this is a file, not a folder"
+        raise UserError(what, out, "name a new folder")
+    if not capture.frames:
+        raise UserError("no frame can be used", capture.path, "see why with deltas depth")
+    beside = Path(os.path.abspath(out))
+    made = [folder for folder in beside.parents if not folder.exists()]
+    temporary = beside.with_name(f".{beside.name}.{secrets.token_hex(4)}.deltas-tmp")
+    try:
+        temporary.mkdir(parents=True)
+        said = WRITERS[to](capture, temporary, placing)
+        if out.exists():
+            out.rmdir()  # an empty one: not every system renames to what is there
+        os.replace(temporary, beside)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        if isinstance(error, OSError):
+            what = f"the capture cannot be written ({error.strerror or error})"
+            where = Path(error.filename or out)
+            raise UserError(
+                what, where, "name a place that can be written and has space"
+            ) from error
+        raise
+    return said

@@ -1,0 +1,120 @@
+"""A capture as transforms.json, which nerfstudio and instant-ngp read."""
+
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.points import SparsePoints
+from deltas_nets.captures.writers.files import (
+    Placing,
+    PutDepth,
+    check_no_skew,
+    depth_is_registered,
+    image_name,
+    put_image,
+    put_registered_depth,
+    write_frames_json,
+    write_millimetres,
+)
+from deltas_nets.errors import UserError
+
+__all__ = ["write"]
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+_NAMES = {
+    "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
+    "RADIAL": ("OPENCV", ("k1", "k2")),
+    "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2", "k3")),
+    "SIMPLE_FISHEYE": ("OPENCV_FISHEYE", ()),
+    "FISHEYE": ("OPENCV_FISHEYE", ()),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1",)),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+    "EQUIRECTANGULAR": ("EQUIRECTANGULAR", ()),
+}
+"""By COLMAP's name: the one of transforms.json, and its names of the coefficients."""
+
+
+def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
+    """Write the file, images/ and depth/; see `deltas_nets.captures.writers` for the contract."""
+    check_no_skew(capture, "transforms.json")
+    for camera in capture.frames.arrays.cameras:
+        _lens(camera.lens, capture.path)
+    scales = {camera.depth_scale for camera in capture.frames.arrays.cameras}
+    scale = scales.pop() if len(scales) == 1 else MILLIMETRES
+    root: dict[str, object] = {
+        # Ours: others leave it alone, and without it no reader knows.
+        "units": "metres" if capture.metric else "unknown",
+        "depth_unit_scale_factor": 1 / scale,
+    }
+    said = []
+    if capture.points is not None:
+        _write_ply(capture.points, folder / "sparse_points.ply")
+        root["ply_file_path"] = "sparse_points.ply"
+        said.append(
+            "which frame sees which sparse point is left out: the format has no place for it"
+        )
+    frames = [_frame(frame, folder, placing, scale) for frame in capture.frames.values()]
+    write_frames_json(folder / "transforms.json", root, frames)
+    return said
+
+
+def _frame(frame: Frame, folder: Path, placing: Placing, scale: float) -> dict[str, object]:
+    name = f"images/{image_name(frame)}"
+    put_image(frame, folder / name, placing)
+    height, width = frame.image_size
+    said: dict[str, object] = {
+        "file_path": name,
+        "w": width,
+        "h": height,
+        "fl_x": float(frame.K[0, 0]),
+        "fl_y": float(frame.K[1, 1]),
+        "cx": float(frame.K[0, 2]) + 0.5,
+        "cy": float(frame.K[1, 2]) + 0.5,
+        **_lens(frame.lens, frame.image_path),
+        "transform_matrix": (np.linalg.inv(frame.cam_from_world) @ OPENGL).tolist(),
+    }
+    depth = _put_depth(frame, folder / "depth" / frame.id, placing, scale)
+    if depth is not None:
+        said["depth_file_path"] = depth.path.relative_to(folder).as_posix()
+    return said
+
+
+def _put_depth(frame: Frame, target: Path, placing: Placing, scale: float) -> PutDepth | None:
+    """Depth at the steps that the file states of all, which is what most have already."""
+    as_it_is = frame.depth_scale == scale and frame.depth_span is None
+    if frame.depth_path is None or (as_it_is and depth_is_registered(frame)):
+        return put_registered_depth(frame, target, placing)
+    if scale != MILLIMETRES:
+        what = f"depth has {scale:g} steps in a unit, and some must be written anew"
+        raise UserError(what, frame.depth_path, "use --to own")
+    return (
+        write_millimetres(frame.read_depth(), target, frame)
+        if depth_is_registered(frame)
+        else put_registered_depth(frame, target, placing)
+    )
+
+
+def _lens(lens: Lens | None, path: Path) -> dict[str, object]:
+    if lens is None:
+        return {"camera_model": "OPENCV"}
+    name, keys = _NAMES.get(lens.model, ("", ()))
+    rest = lens.coefficients[len(keys) :]
+    if not name or any(rest):
+        what = f"transforms.json has no lens like {lens.model} {' '.join(map(str, rest))}".rstrip()
+        raise UserError(what, path, "use --to own or colmap, or undistort the images")
+    return {"camera_model": name, **dict(zip(keys, lens.coefficients, strict=False))}
+
+
+def _write_ply(points: SparsePoints, path: Path) -> None:
+    kind = [("xyz", "<f8", 3), ("rgb", "u1", 3)]
+    table = np.empty(len(points.xyz), kind)
+    table["xyz"], table["rgb"] = points.xyz, points.rgb
+    columns = [f"property double {axis}" for axis in "xyz"]
+    columns += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *columns]
+    path.write_bytes("\n".join([*head, "end_header", ""]).encode() + table.tobytes())
