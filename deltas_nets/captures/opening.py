@@ -10,7 +10,9 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.readers import (
     colmap,
+    demon,
     kapture,
+    mvsnet,
     openmvg,
     opensfm,
     own,
@@ -18,10 +20,13 @@ from deltas_nets.captures.readers import (
     record3d,
     robustmvd,
     scannet,
+    sens,
     sevenscenes,
+    strecha,
     transforms,
     tum,
 )
+from deltas_nets.captures.readers.refused import refusal
 from deltas_nets.errors import UserError
 
 __all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
@@ -69,6 +74,10 @@ READERS: tuple[Reader, ...] = (
     opensfm,
     openmvg,
     kapture,
+    mvsnet,
+    sens,
+    demon,
+    strecha,
 )
 """The first that recognises a folder reads it."""
 
@@ -96,7 +105,7 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
         reader = next((reader for reader in READERS if reader.recognises(path)), None)
         if reader is None:
             what = "there is no capture in the folder" if path.is_dir() else "this is no capture"
-            raise UserError(what, path, layouts)
+            raise refusal(path) or UserError(what, path, layouts)
         return _usable(_read(reader, path, intrinsics))
     except OSError as error:
         what = f"the capture cannot be read ({error.strerror or error})"

@@ -1,0 +1,78 @@
+"""DeMoN's data as DPSNet prepared it: cam.txt, poses.txt, 0000.jpg and 0000.npy of depth."""
+
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.images import image_size_of
+from deltas_nets.captures.readers.intrinsics import read_intrinsics
+from deltas_nets.captures.readers.numbered import numbered_files
+from deltas_nets.captures.readers.poses import cam_from_world, missing_images
+from deltas_nets.captures.text_lines import read_lines
+from deltas_nets.errors import UserError
+
+__all__ = ["LAYOUT", "read", "recognises"]
+
+LAYOUT = "cam.txt, poses.txt and 0000.jpg (DeMoN as DPSNet prepared it)"
+_REMEDY = "write a line of 12 numbers for each image, world-to-camera"
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has the two files."""
+    return (path / "cam.txt").is_file() and (path / "poses.txt").is_file()
+
+
+def read(path: Path) -> Capture:
+    """Read one scene; see `deltas_nets.captures.opening.Reader` for the contract."""
+    file = path / "poses.txt"
+    rows = _rows(file)
+    images = numbered_files(path, (".jpg", ".jpeg", ".png"))
+    depths = numbered_files(path, (".npy",))
+    sizes = (image_size_of(image) for image in images.values())
+    K = read_intrinsics(path / "cam.txt", next((size for size in sizes if size), None))
+    frames: list[Frame] = []
+    lost: dict[str, Lost] = {}
+    missing = []
+    for number in sorted(images.keys() | set(range(len(rows)))):
+        id = f"{number:04d}"
+        if number >= len(rows):
+            what = f"frame {id} has no pose"
+            lost[id] = Lost("no pose", UserError(what, file, _REMEDY))
+            continue
+        size = image_size_of(images[number]) if number in images else None
+        if size is None:
+            missing.append(id)
+            continue
+        pose = cam_from_world(rows[number].reshape(3, 4), id=id, path=file)
+        if isinstance(pose, Lost):
+            lost[id] = pose
+            continue
+        frames.append(
+            Frame(
+                id=id,
+                image_path=images[number],
+                image_size=size,
+                K=K,
+                cam_from_world=pose,
+                depth_path=depths.get(number),
+            )
+        )
+    lost |= missing_images(missing, path)
+    return Capture(path, Frames.of(frames, path), lost, layout="DeMoN", metric=True)
+
+
+def _rows(path: Path) -> np.ndarray:
+    """``(F, 12)``."""
+    rows = []
+    for number, words in read_lines(path, name="list of poses", remedy=_REMEDY):
+        if len(words) != 12:
+            raise UserError(f"line {number} has {len(words)} numbers, not 12", path, _REMEDY)
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            what = f"line {number} holds {' '.join(words)[:40]!r} where numbers should be"
+            raise UserError(what, path, _REMEDY) from error
+    return np.array(rows, dtype=np.float64).reshape(-1, 12)

@@ -1,0 +1,83 @@
+"""Strecha's multi-view benchmark: 0000.jpg and 0000.jpg.camera."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.images import image_size_of
+from deltas_nets.captures.readers.cameras import camera_matrix, fitted
+from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.names import frame_ids
+from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images, rigid
+from deltas_nets.captures.text_lines import read_numbers
+from deltas_nets.errors import UserError
+
+__all__ = ["LAYOUT", "read", "recognises"]
+
+LAYOUT = "0000.jpg and 0000.jpg.camera (Strecha)"
+_REMEDY = "write K (3x3), three zeros, R (3x3, camera-to-world), the centre, width and height"
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder, or one in it, holds .camera files."""
+    return bool(_cameras(path))
+
+
+def read(path: Path) -> Capture:
+    """Read cameras; see `deltas_nets.captures.opening.Reader` for the contract."""
+    files = _cameras(path)
+    names = [file.name.removesuffix(".camera") for file in files]
+    ids = frame_ids(names, files[0].parent) if files else []
+    finder = FileFinder(path, (files[0].parent, path / "images")) if files else FileFinder(path)
+    frames: list[Frame] = []
+    lost: dict[str, Lost] = {}
+    missing, bent = [], 0
+    for file, name, id in zip(files, names, ids, strict=True):
+        image = finder.find(name) or finder.find(Path(name).stem)
+        size = None if image is None else image_size_of(image)
+        if image is None or size is None:
+            missing.append(id)
+            continue
+        numbers = np.array(read_numbers(file, name="camera", remedy=_REMEDY))
+        if len(numbers) != 26:
+            what = f"the camera file has {len(numbers)} numbers, not 26"
+            raise UserError(what, file, _REMEDY)
+        K, bends, rotation, centre, sides = np.split(numbers, (9, 12, 21, 24))
+        bent += bool(bends.any())
+        pose = cam_from_world_of(rigid(rotation.reshape(3, 3), centre), id=id, path=file)
+        if isinstance(pose, Lost):
+            lost[id] = pose
+            continue
+        if not (np.isfinite(sides).all() and (sides >= 1).all()):
+            raise UserError("the camera's width and height are no sizes", file, _REMEDY)
+        stated = int(sides[1]), int(sides[0])
+        matrix = camera_matrix(K[0], K[4], K[2], K[5], path=file)
+        frames.append(
+            Frame(
+                id=id,
+                image_path=image,
+                image_size=size,
+                K=fitted(matrix, stated, size, path=file),
+                cam_from_world=pose,
+            )
+        )
+    lost |= missing_images(missing, path)
+    doubts = []
+    if bent:
+        doubts.append(f"{bent} cameras state a distortion, which is not undone, {path}")
+    return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "Strecha", metric=False)
+
+
+def _cameras(path: Path) -> Sequence[Path]:
+    """Of the folder, or of the first in it that has some."""
+    if not path.is_dir():
+        return ()
+    found = sorted(path.glob("*.camera"))
+    if not found:
+        inside = sorted(path.glob("*/*.camera"))
+        found = [file for file in inside if file.parent == inside[0].parent]
+    return found
