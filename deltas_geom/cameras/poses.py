@@ -54,6 +54,28 @@ def camera_centers(cam_from_world: Tensor) -> Tensor:
     return only(centers, finite, other=torch.nan).squeeze(-2)
 
 
+@without_autocast
+def recentred(cam_from_world: Tensor, view: int | None) -> tuple[Tensor, Tensor]:
+    """Poses ``(*B, V, 4, 4)`` in a world moved to the centre of a view or of all: and by how much.
+
+    Returns:
+        The poses, and ``(*B, 3)``, which added to points gives those of the old world.
+    """
+    known, finite = finite_or_zero(cam_from_world, dims=2)
+    rotation, translation = known[..., :3, :].split_with_sizes([3, 1], dim=-1)
+    centers = -(rotation * translation).sum(dim=-2)
+    sound = torch.ones_like(centers[..., :1]) if finite is None else finite[..., 0].to(known)
+    if view is None:
+        offset = centers.sum(dim=-2) / sound.sum(dim=-2).clamp(min=1)
+    else:
+        offset = centers.select(-2, view)
+    # The difference of centres first: the translation itself may be rounded at its size.
+    moved = rotation @ (offset.unsqueeze(-2) - centers).unsqueeze(-1)
+    rows = torch.cat([rotation, moved], dim=-1)
+    poses = torch.cat([rows, known[..., 3:, :]], dim=-2)
+    return only(poses, finite, other=torch.nan), offset
+
+
 def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:
     """Whether ``(*B, 4, 4)`` are finite rotations with a translation, ``(*B)`` bool.
 

@@ -8,8 +8,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
-from deltas_geom.cameras.poses import invert_pose, is_rigid
-from deltas_geom.checks import ShapeError, batch_shape, check_shapes, check_tensor
+from deltas_geom.cameras.posed_shapes import posed_shapes
+from deltas_geom.cameras.poses import invert_pose, is_rigid, recentred
+from deltas_geom.cameras.pytorch3d import from_pytorch3d
+from deltas_geom.checks import ShapeError, check_tensor
 from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
@@ -82,7 +84,7 @@ class PosedViews(Record):
             ShapeError: a trailing shape differs.
             TypeError: not a tensor.
         """
-        _check_shapes(K, world_from_cam, "world_from_cam")
+        posed_shapes(K, world_from_cam, "world_from_cam")
         return cls(K, invert_pose(world_from_cam))
 
     @classmethod
@@ -100,9 +102,40 @@ class PosedViews(Record):
             >>> views.cam_from_world[0].diagonal()
             tensor([ 1., -1., -1.,  1.])
         """
-        _check_shapes(K, world_from_cam, "world_from_cam")
+        posed_shapes(K, world_from_cam, "world_from_cam")
         x, y, z, center = world_from_cam.unbind(dim=-1)
         return cls(K, invert_pose(torch.stack([x, -y, -z, center], dim=-1)))
+
+    @classmethod
+    def from_pytorch3d(
+        cls,
+        R: Tensor,
+        T: Tensor,
+        focal_length: Tensor,
+        principal_point: Tensor,
+        *,
+        image_size: tuple[int, int],
+    ) -> Self:
+        """From a PyTorch3D ``PerspectiveCameras`` in NDC, as its constructor takes them.
+
+        There points are rows, X_cam = X_world R + T; x points left, y up, z forward; and NDC goes
+        from -1 to 1 over the shorter side of the image.
+
+        Args:
+            R: ``(*B, V, 3, 3)`` rotations.
+            T: ``(*B, V, 3)`` translations, metres.
+            focal_length: ``(*B, V, 2)`` in NDC. Of a camera made with ``in_ndc=False`` pass
+                2 f / min(H, W), f being in pixels.
+            principal_point: ``(*B, V, 2)`` in NDC, x left and y up of the middle. Of
+                ``in_ndc=False`` pass (W - 2 px, H - 2 py) / min(H, W).
+            image_size: (height, width).
+
+        Raises:
+            ShapeError: a trailing shape differs, or batch dims do not broadcast.
+
+        Source: PyTorch3D's ``cameras_from_opencv_projection``, the other way.
+        """
+        return cls(*from_pytorch3d(R, T, focal_length, principal_point, image_size))
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera, *, num_views: int | None = None) -> Self:
@@ -173,6 +206,30 @@ class PosedViews(Record):
         """The same cameras when their images are cropped: pixel (left, top) becomes (0, 0)."""
         return self._replace(K=crop_intrinsics(self.K, left=left, top=top))
 
+    def recentred(self, view: int | None = 0) -> tuple[Self, Tensor]:
+        """The same cameras in a world whose origin is a camera's centre, or the mean of centres.
+
+        For coordinates far from their origin, as of maps: 500 km are known to 3 cm in float32. Do
+        it in float64, and cast what comes of it.
+
+        Args:
+            view: whose centre becomes the origin; None takes the mean of all.
+
+        Returns:
+            Views, and the offset ``(*B, 3)``, metres: points of the old world are those of the new
+            one plus the offset. It is 0 where that centre is not finite.
+
+        Example:
+            >>> poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+            >>> poses[:, 0, 3] = torch.tensor([-500000.25, -500000.5])
+            >>> views, offset = PosedViews(torch.eye(3).repeat(2, 1, 1), poses).recentred()
+            >>> offset[0].item(), views.cam_from_world[1, 0, 3].item()
+            (500000.25, -0.25)
+        """
+        self.check_shapes()
+        moved, offset = recentred(self.cam_from_world, view)
+        return self._replace(cam_from_world=moved), offset
+
     def check_shapes(self) -> torch.Size:
         """``*B``, to which K and cam_from_world broadcast.
 
@@ -180,7 +237,7 @@ class PosedViews(Record):
             ShapeError: a trailing shape differs, each has another V, or ``*B`` does not broadcast.
             TypeError: not a tensor, or of integers.
         """
-        return _check_shapes(self.K, self.cam_from_world, "cam_from_world")
+        return posed_shapes(self.K, self.cam_from_world, "cam_from_world")
 
     def check_values(self) -> None:
         """Raise ``ValueError`` unless K is an upper triangular camera and poses are rigid.
@@ -235,29 +292,3 @@ def finite_intrinsics(K: Tensor) -> tuple[Tensor, Tensor | None]:
     known = (plain.abs().amax(dim=(-2, -1)) < torch.inf) & (focal[..., 0] * focal[..., 1] != 0)
     known = known[..., None, None]
     return torch.where(known, K, torch.eye(3, device=K.device, dtype=K.dtype)), known
-
-
-def _check_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:
-    """``*B`` of K and ``poses``, whose name is ``name``; raise unless they go together."""
-    tensors = isinstance(K, Tensor) and isinstance(poses, Tensor)
-    if tensors and K.shape[-3:-2] != poses.shape[-3:-2]:
-        _refuse_one_for_all(K, poses, name)
-    check_shapes(**{"K": (K, "V 3 3"), name: (poses, "V 4 4")})
-    return batch_shape(K.shape[:-3], poses.shape[:-3])
-
-
-def _refuse_one_for_all(K: Tensor, poses: Tensor, name: str) -> None:
-    """Raise ``ShapeError`` with the cure where K seems to be one for all views."""
-    if K.shape[-2:] != (3, 3) or poses.shape[-2:] != (4, 4) or poses.ndim < 3:
-        return
-    views = poses.shape[-3]
-    if K.ndim == 2 or K.shape[-3] == 1:
-        cure = f"K.expand{(*K.shape[:-3], views, 3, 3)}"
-    elif K.shape[:-2] == poses.shape[:-3]:
-        cure = f"K[..., None, :, :].expand{(*K.shape[:-2], views, 3, 3)}"
-    else:
-        return
-    raise ShapeError(
-        f"K must have shape (*B, {views}, 3, 3), as {name} has V = {views}, "
-        f"got {tuple(K.shape)}: for one K of all views pass {cure}"
-    )

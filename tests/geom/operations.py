@@ -51,8 +51,10 @@ def inputs_in(dtype: torch.dtype, num: int = 6) -> Inputs:
         "spread": square[:, :2, :2] @ square[:, :2, :2].mT + torch.eye(2),
         "own_points": torch.cat([0.3 * drawn(num, 2) - 0.1, 0.8 + drawn(num, 1)], dim=-1),
         "coefficients": torch.tensor([-0.1, 0.02, 1e-3, -2e-3]),
+        "ndc": 0.3 * drawn(3, 4),
         "one_K": views.K[0],
         "small_K": torch.tensor([[9.0, 0.2, 8.0], [0, 10, 5.5], [0, 0, 1]]),
+        "new_K": torch.tensor([[3.0, 0.0, 2.4], [0, 4, 2.1], [0, 0, 1]]),
         "pose_spread": 1e-6 * torch.eye(6).expand(3, 6, 6),
         "descriptors": drawn(num, 5),
         "maps": maps,
@@ -242,8 +244,8 @@ OPERATIONS: dict[str, Operation] = {
     "undistort_image": lambda small_K, coefficients, image: geom.undistort_image(
         through(small_K, coefficients), image
     ),
-    "undistort_image, K": lambda small_K, coefficients, image: geom.undistort_image(
-        through(small_K, coefficients), image, new_K=0.9 * small_K, new_size=(5, 6)
+    "undistort_image, K": lambda small_K, coefficients, image, new_K: geom.undistort_image(
+        through(small_K, coefficients), image, new_K=new_K, new_size=(5, 6)
     ),
     "undistort_pixels": lambda one_K, coefficients, keypoints: geom.undistort_pixels(
         through(one_K, coefficients), keypoints
@@ -260,6 +262,10 @@ METHODS: dict[str, Operation] = {
     "select": lambda K, poses: PosedViews(K, poses).select(0),
     "from_opengl": lambda K, poses: PosedViews.from_opengl(K, poses),
     "from_world_from_cam": lambda K, poses: PosedViews.from_world_from_cam(K, poses),
+    "from_pytorch3d": lambda poses, ndc: PosedViews.from_pytorch3d(
+        poses[..., :3, :3], poses[..., :3, 3], 1 + ndc[..., :2], ndc[..., 2:], image_size=SIZE
+    ),
+    "recentred": lambda K, poses: PosedViews(K, poses).recentred(None),
     "resize": lambda K, poses: PosedViews(K, poses).resize(old_size=SIZE, new_size=(24, 32)),
     "crop": lambda K, poses: PosedViews(K, poses).crop(left=2, top=1),
     "EpipolarSampler": along_lines,

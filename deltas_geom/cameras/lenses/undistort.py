@@ -14,6 +14,7 @@ from deltas_geom.cameras.pixels import in_image, normalize_pixels, pixel_grid
 from deltas_geom.cameras.projection import pixel_rays
 from deltas_geom.checks import batch_shape, check_image_size, check_shapes
 from deltas_geom.numerics.arithmetic import (
+    finite_or_zero,
     numbers_or_zero,
     only,
     surely_all,
@@ -161,6 +162,7 @@ def _remapped(
     )
     mask = valid.expand(*batch, valid.shape[-1]).reshape(*batch, 1, *new_size)
     image = read.reshape(*batch, image.shape[-3], *new_size)
+    new_K, _ = finite_or_zero(new_K, dims=2)
     return only(image, mask), new_K, mask
 
 

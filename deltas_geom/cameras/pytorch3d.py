@@ -1,0 +1,42 @@
+"""PyTorch3D's cameras as ours."""
+
+import torch
+from torch import Tensor
+
+from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.numerics.arithmetic import promoted, without_autocast
+
+
+@without_autocast
+def from_pytorch3d(
+    R: Tensor,
+    T: Tensor,
+    focal_length: Tensor,
+    principal_point: Tensor,
+    image_size: tuple[int, int],
+) -> tuple[Tensor, Tensor]:
+    """K ``(*B, V, 3, 3)`` and ``cam_from_world`` of :meth:`PosedViews.from_pytorch3d`."""
+    check_image_size(image_size)
+    check_shapes(
+        R=(R, "V 3 3"),
+        T=(T, "V 3"),
+        focal_length=(focal_length, "V 2"),
+        principal_point=(principal_point, "V 2"),
+    )
+    given = promoted(R, T, focal_length, principal_point)
+    batch = batch_shape(R.shape[:-3], *(each.shape[:-2] for each in given[1:]))
+    R, T, focal, principal = (
+        each.expand(*batch, *each.shape[dims:])
+        for each, dims in zip(given, (-3, -2, -2, -2), strict=True)
+    )
+    height, width = image_size
+    shorter = min(image_size) / 2  # px of a unit of NDC
+    fx, fy = (shorter * focal).unbind(dim=-1)
+    left, up = (shorter * principal).unbind(dim=-1)
+    none, one = torch.zeros_like(fx), torch.ones_like(fx)
+    # Half of the width is the middle counted from the corner; our centres are at integers.
+    cx, cy = (width - 1) / 2 - left, (height - 1) / 2 - up
+    K = torch.stack([fx, none, cx, none, fy, cy, none, none, one], dim=-1)
+    x, y, z = torch.cat([R.mT, T.unsqueeze(-1)], dim=-1).unbind(dim=-2)
+    last = torch.stack([none, none, none, one], dim=-1)
+    return K.reshape(*fx.shape, 3, 3), torch.stack([-x, -y, z, last], dim=-2)
