@@ -20,10 +20,10 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -48,11 +48,16 @@ from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit
 
+# Drawn once for all runs: rendering takes longer than the steps.
+KEPT = tempfile.TemporaryDirectory(prefix="rooms-")
+HELD_OUT = Rooms(1, num_views=2, image_size=(48, 64), cache_dir=Path(KEPT.name))
+"""What small runs are validated on."""
+
 CONFIG = TrainConfig(
     network=NetworkConfig(
         detector=DetectorConfig(num_keypoints=48), matcher=MatcherConfig(num_samples=32)
     ),
-    data=DataConfig(num_rooms=4, num_views=3, height=48, width=64, workers=0),
+    data=DataConfig(num_rooms=4, num_views=3, height=48, width=64, workers=0, cache=KEPT.name),
     sizes=((48, 64),),
     steps=8,
     batch_size=4,
@@ -68,8 +73,7 @@ def launch(
     """Start processes that train, without waiting for them."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder.with_suffix(".json")
-    data = replace(config.data, cache=str(folder.parent / "rooms"))
-    file.write_text(json.dumps(to_dict(replace(config, data=data))))
+    file.write_text(json.dumps(to_dict(config)))
     torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
     return subprocess.Popen(
         [
@@ -92,8 +96,8 @@ def launch(
 def train(folder: Path, config: TrainConfig, start: Start, *, stop: int | None = None) -> None:
     """Train in this process; validation looks at one small room."""
     rooms, threads = fit_module.validation_rooms, torch.get_num_threads()
-    few = Rooms(1, num_views=2, image_size=(48, 64))
-    fit_module.validation_rooms = lambda: few
+    kept = Path(config.data.cache) if config.data.cache else None
+    fit_module.validation_rooms = lambda: Rooms(1, num_views=2, image_size=(48, 64), cache_dir=kept)
     torch.set_num_threads(1)  # as in every other process, to the last bit
     try:
         fit(
@@ -228,9 +232,10 @@ def get_told_to_stop(tell: Callable[[int], None]) -> None:
 
 
 def main() -> None:
+    KEPT.cleanup()  # the config names the one of who started this process
     folder, config = Path(sys.argv[1]), json.loads(Path(sys.argv[2]).read_text())
     options = dict(option.partition("=")[::2] for option in sys.argv[3:])
-    rank = os.environ.get("RANK", "0")
+    rank = os.environ.get("RANK") or os.environ.get("LOCAL_RANK", "0")
     fit_module.PATIENCE = 2
     if "half" in options:
         stop_half_written(folder, int(options["half"]))

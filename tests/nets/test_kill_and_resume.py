@@ -6,18 +6,29 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from run_fit import CONFIG, assert_same_state, finish, launch, logged, read_checkpoint, train
+import pytest
+from run_fit import CONFIG as CONFIG_OF_FOUR
+from run_fit import assert_same_state, finish, launch, logged, read_checkpoint, train
 
 from deltas_nets.train.fit import Start
 
 HALF_WRITTEN = ".checkpoint.pt.*.deltas-tmp"
+CONFIG = replace(CONFIG_OF_FOUR, batch_size=2, steps=7)
 
 
-def test_a_run_killed_while_it_writes_a_checkpoint_ends_as_an_unbroken_one(tmp_path: Path) -> None:
-    unbroken, killed = tmp_path / "unbroken", tmp_path / "killed"
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unbroken")
+    train(folder, CONFIG, Start())
+    return folder
+
+
+def test_a_run_killed_while_it_writes_a_checkpoint_ends_as_an_unbroken_one(
+    tmp_path: Path, unbroken: Path
+) -> None:
+    killed = tmp_path / "killed"
     process = launch(killed, CONFIG, "half=6")
-    train(unbroken, CONFIG, Start())
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while not (killed / "writing").exists():
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()[0]
         time.sleep(0.05)
@@ -36,14 +47,15 @@ def test_a_run_killed_while_it_writes_a_checkpoint_ends_as_an_unbroken_one(tmp_p
     assert not list(killed.glob(".*"))
 
 
-def test_a_signal_to_the_whole_group_ends_it_between_two_steps(tmp_path: Path) -> None:
+def test_a_signal_to_the_whole_group_ends_it_between_two_steps(
+    tmp_path: Path, unbroken: Path
+) -> None:
     """A terminal's Ctrl-C, `timeout` and job schedulers reach the processes that render, too."""
-    unbroken, stopped = tmp_path / "unbroken", tmp_path / "stopped"
+    stopped = tmp_path / "stopped"
     ahead = replace(CONFIG, data=replace(CONFIG.data, workers=2))
     said = finish(launch(stopped, ahead, "stop-all"), code=-signal.SIGINT)
     assert "KeyboardInterrupt" in said
     assert "exited unexpectedly" not in said
     assert read_checkpoint(stopped)["step"] == 2
-    train(unbroken, CONFIG, Start())
     train(stopped, CONFIG, Start(resume=True))
     assert_same_state(stopped, unbroken)

@@ -1,6 +1,7 @@
-"""Training: ten steps and a prediction, batches by number, resume and start from weights."""
+"""Training: six steps and a prediction, batches by number, resume and start from weights."""
 
 import json
+import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -8,12 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from run_fit import assert_same_state, logged
+from run_fit import CONFIG as CONFIG_OF_FOUR
+from run_fit import HELD_OUT, assert_same_state, logged, read_checkpoint, train
 
 from deltas_geom import PosedViews, fundamental_between, in_image, project, unproject
 from deltas_nets import load_model
 from deltas_nets.captures.posed_images import PosedImages
-from deltas_nets.config import DataConfig, DetectorConfig, MatcherConfig, NetworkConfig, TrainConfig
 from deltas_nets.config.schedule import rate_factor
 from deltas_nets.datasets.augment import (
     Photometry,
@@ -25,7 +26,7 @@ from deltas_nets.datasets.augment import (
 )
 from deltas_nets.errors import UserError
 from deltas_nets.losses.targets import read_nearest
-from deltas_nets.rooms import Rooms, render_room
+from deltas_nets.rooms import render_room
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.fit import Start, fit
@@ -33,24 +34,12 @@ from deltas_nets.train.loader import Part, StepSampler, room_loader
 from deltas_nets.train.log import drop_later_entries
 from deltas_nets.train.step import Stepper, StepResult
 
-CONFIG = TrainConfig(
-    network=NetworkConfig(
-        detector=DetectorConfig(num_keypoints=48), matcher=MatcherConfig(num_samples=32)
-    ),
-    data=DataConfig(num_rooms=4, num_views=3, height=48, width=64, workers=0),
-    sizes=((48, 64),),
-    steps=10,
-    batch_size=2,
-    warmup=2,
-    max_views=3,
-    num_keypoints=48,
-)
+CONFIG = replace(CONFIG_OF_FOUR, batch_size=2, steps=6)
 
 
 @pytest.fixture(autouse=True)
 def _small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = Rooms(1, num_views=2, image_size=(48, 64))
-    monkeypatch.setattr(fit_module, "validation_rooms", lambda: few)
+    monkeypatch.setattr(fit_module, "validation_rooms", lambda: HELD_OUT)
 
 
 @pytest.fixture(scope="module")
@@ -83,44 +72,44 @@ def consistent_share(room: PosedImages) -> float:
     return float(agrees[inside].float().mean())
 
 
-def test_ten_steps_then_a_prediction(tmp_path: Path) -> None:
-    said: list[str] = []
-    weights = fit(CONFIG, tmp_path / "run", Start(), report=said.append)
-    model = load_model(weights)
-    room = render_room(0, num_views=2, image_size=(48, 64))
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unbroken")
+    train(folder, CONFIG, Start())
+    return folder
+
+
+@pytest.fixture
+def copy(unbroken: Path, tmp_path: Path) -> Path:
+    """To go on with, or to spoil."""
+    return Path(shutil.copytree(unbroken, tmp_path / "copy"))
+
+
+def test_six_steps_then_a_prediction(unbroken: Path) -> None:
+    model = load_model(unbroken / "weights.safetensors")
+    room = HELD_OUT[0]
     with torch.no_grad():
         depth = model(room.images.float() / 255, room.views).depth
     assert depth.isfinite().all()
     assert (depth > 0).all()
-    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert log[-2]["step"] == 10
+    log = [json.loads(line) for line in (unbroken / "log.jsonl").read_text().splitlines()]
+    assert log[-2]["step"] == 6
     assert "abs_rel" in log[-1]["validation"]
-    assert "held-out rooms Abs Rel" in said[-1]
-
-
-@pytest.fixture(scope="module")
-def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("unbroken")
-    with pytest.MonkeyPatch.context() as patch:
-        few = Rooms(1, num_views=2, image_size=(48, 64))
-        patch.setattr(fit_module, "validation_rooms", lambda: few)
-        fit(CONFIG, folder, Start(), log_every=1)
-    return folder
 
 
 def test_a_resumed_run_equals_an_unbroken_one(tmp_path: Path, unbroken: Path) -> None:
-    fit(CONFIG, tmp_path, Start(), stop=5, log_every=1)
-    fit(CONFIG, tmp_path, Start(resume=True), log_every=1)
+    train(tmp_path, CONFIG, Start(), stop=2)
+    train(tmp_path, CONFIG, Start(resume=True))
     assert_same_state(tmp_path, unbroken)
     assert logged(tmp_path) == logged(unbroken)
 
 
 def test_a_run_whose_rooms_wait_in_memory_resumes_as_if_unbroken(tmp_path: Path) -> None:
     data = replace(CONFIG.data, num_rooms=40, replay=2, shelf=2)
-    config = replace(CONFIG, data=data, steps=6)
-    fit(config, tmp_path / "whole", Start(), log_every=1)
-    fit(config, tmp_path / "broken", Start(), stop=3, log_every=1)
-    fit(config, tmp_path / "broken", Start(resume=True), log_every=1)
+    config = replace(CONFIG, data=data, steps=4)
+    train(tmp_path / "whole", config, Start())
+    train(tmp_path / "broken", config, Start(), stop=2)
+    train(tmp_path / "broken", config, Start(resume=True))
     assert_same_state(tmp_path / "broken", tmp_path / "whole")
 
 
@@ -130,30 +119,31 @@ def test_a_run_told_to_stop_finishes_its_step_and_goes_on_later(
 ) -> None:
     take, calls = Stepper.__call__, []
 
-    def told_in_the_fourth(stepper: Stepper, batch: Batch, *, stop: bool) -> StepResult:
+    def told_in_the_third(stepper: Stepper, batch: Batch, *, stop: bool) -> StepResult:
         calls.append(stop)
-        if len(calls) == 4:
+        if len(calls) == 3:
             signal.raise_signal(number)
         return take(stepper, batch, stop=stop)
 
     before = signal.getsignal(number)
     with monkeypatch.context() as patch:
-        patch.setattr(Stepper, "__call__", told_in_the_fourth)
+        patch.setattr(Stepper, "__call__", told_in_the_third)
         with pytest.raises(KeyboardInterrupt):
-            fit(CONFIG, tmp_path, Start(), log_every=1)
+            train(tmp_path, CONFIG, Start())
     assert signal.getsignal(number) == before
-    content = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    assert content["step"] == 5  # the next step's end is where all processes hear of it
-    fit(CONFIG, tmp_path, Start(resume=True), log_every=1)
+    assert (
+        read_checkpoint(tmp_path)["step"] == 4
+    )  # the next step's end is where all processes hear of it
+    train(tmp_path, CONFIG, Start(resume=True))
     assert_same_state(tmp_path, unbroken)
 
 
-def test_a_finished_run_has_nothing_left_to_do(tmp_path: Path) -> None:
-    config = replace(CONFIG, steps=2)
-    weights = fit(config, tmp_path, Start())
-    before = weights.read_bytes(), (tmp_path / "log.jsonl").read_text()
-    assert fit(config, tmp_path, Start(resume=True)) == weights
-    assert (weights.read_bytes(), (tmp_path / "log.jsonl").read_text()) == before
+def test_a_finished_run_has_nothing_left_to_do(copy: Path) -> None:
+    weights, log = copy / "weights.safetensors", copy / "log.jsonl"
+    before = weights.read_bytes(), log.read_text()
+    said: list[str] = []
+    assert fit(CONFIG, copy, Start(resume=True), report=said.append) == weights
+    assert (weights.read_bytes(), log.read_text()) == before
 
 
 def test_a_run_killed_in_its_last_validation_makes_up_for_it(
@@ -168,10 +158,10 @@ def test_a_run_killed_in_its_last_validation_makes_up_for_it(
     with monkeypatch.context() as patch:
         patch.setattr(fit_module, "validate", kill)
         with pytest.raises(Killed):
-            fit(CONFIG, tmp_path, Start(), stop=2)
-    fit(CONFIG, tmp_path, Start(resume=True), stop=2)
+            fit(CONFIG, tmp_path, Start(), stop=1)
+    fit(CONFIG, tmp_path, Start(resume=True), stop=1)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines if "validation" in line] == [2]
+    assert [line["step"] for line in lines if "validation" in line] == [1]
 
 
 def poison(monkeypatch: pytest.MonkeyPatch, steps: set[int]) -> None:
@@ -189,14 +179,12 @@ def poison(monkeypatch: pytest.MonkeyPatch, steps: set[int]) -> None:
 def test_a_step_without_a_usable_gradient_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit(CONFIG, tmp_path / "good", Start(), stop=3, log_every=1)
-    poison(monkeypatch, {3, 4})
-    fit(CONFIG, tmp_path / "bad", Start(), stop=5, log_every=1)
-    assert [entry["total"] for entry in logged(tmp_path / "bad")][3:] == ["nan", "nan"]
-    good, bad = (
-        torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("good", "bad")
-    )
-    assert (good["step"], bad["step"]) == (3, 5)
+    train(tmp_path / "good", CONFIG, Start(), stop=1)
+    poison(monkeypatch, {1, 2})
+    train(tmp_path / "bad", CONFIG, Start(), stop=3)
+    assert [entry["total"] for entry in logged(tmp_path / "bad")][1:] == ["nan", "nan"]
+    good, bad = (read_checkpoint(tmp_path / name) for name in ("good", "bad"))
+    assert (good["step"], bad["step"]) == (1, 3)
     for part in ("model", "average"):  # the running statistics of batch norm among them
         for name, tensor in good[part].items():
             assert torch.equal(bad[part][name], tensor), f"{part} {name}"
@@ -204,14 +192,14 @@ def test_a_step_without_a_usable_gradient_changes_nothing(
 
 def test_training_that_diverges_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "PATIENCE", 3)
-    poison(monkeypatch, {0, 1, 3, 4, 5, 6, 7})
+    poison(monkeypatch, {0, 1, 3, 4, 5})
     with pytest.raises(UserError, match=r"no usable gradient in the 3 steps up to 6.*lower --lear"):
         fit(CONFIG, tmp_path, Start())
 
 
 def test_frozen_batch_norm_keeps_its_statistics(tmp_path: Path) -> None:
-    fit(replace(CONFIG, freeze_batch_norm=True), tmp_path, Start(), stop=2)
-    model = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["model"]
+    train(tmp_path, replace(CONFIG, freeze_batch_norm=True), Start(), stop=1)
+    model = read_checkpoint(tmp_path)["model"]
     means = [tensor for name, tensor in model.items() if name.endswith("running_mean")]
     variances = [tensor for name, tensor in model.items() if name.endswith("running_var")]
     assert len(means) == len(variances) > 20
@@ -219,14 +207,13 @@ def test_frozen_batch_norm_keeps_its_statistics(tmp_path: Path) -> None:
     assert all((variance == 1).all() for variance in variances)
 
 
-def test_bfloat16_leaves_weights_in_full_precision(tmp_path: Path) -> None:
-    fit(CONFIG, tmp_path / "full", Start(), stop=2, log_every=1)
-    fit(replace(CONFIG, precision="bf16-mixed"), tmp_path / "half", Start(), stop=2, log_every=1)
-    full, half = logged(tmp_path / "full")[0], logged(tmp_path / "half")[0]
+def test_bfloat16_leaves_weights_in_full_precision(tmp_path: Path, unbroken: Path) -> None:
+    train(tmp_path, replace(CONFIG, precision="bf16-mixed"), Start(), stop=1)
+    full, half = logged(unbroken)[0], logged(tmp_path)[0]
     assert half["total"] != full["total"]
     assert half["total"] == pytest.approx(full["total"], rel=0.05)
-    content = torch.load(tmp_path / "half" / "checkpoint.pt", weights_only=True)
-    kinds = {tensor.dtype for tensor in content["model"].values() if tensor.is_floating_point()}
+    weights = read_checkpoint(tmp_path)["model"].values()
+    kinds = {tensor.dtype for tensor in weights if tensor.is_floating_point()}
     assert kinds == {torch.float32}
 
 
@@ -244,15 +231,14 @@ def test_tensorboard_shows_every_step_once(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     fit(CONFIG, tmp_path, Start(), stop=5, log_every=1, checkpoint_every=4)
     # As if it had been killed after step 5, the last checkpoint being that of step 4.
-    content = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    torch.save({**content, "step": 4}, tmp_path / "checkpoint.pt")
+    torch.save({**read_checkpoint(tmp_path), "step": 4}, tmp_path / "checkpoint.pt")
     fit(CONFIG, tmp_path, Start(resume=True), log_every=1)
     found = events.EventAccumulator(str(tmp_path / "tensorboard"))
     found.Reload()
     tags = set(found.Tags()["scalars"])
     assert {"loss/total", "loss/posterior", "training/rate", "validation/abs_rel"} <= tags
-    assert [scalar.step for scalar in found.Scalars("loss/total")] == list(range(1, 11))
-    assert [entry["step"] for entry in logged(tmp_path)] == list(range(1, 11))
+    assert [scalar.step for scalar in found.Scalars("loss/total")] == list(range(1, 7))
+    assert [entry["step"] for entry in logged(tmp_path)] == list(range(1, 7))
 
 
 def test_without_tensorboard_there_is_the_log(
@@ -265,10 +251,10 @@ def test_without_tensorboard_there_is_the_log(
 
 
 def test_weights_alone_continue_the_schedule(tmp_path: Path) -> None:
-    first = fit(CONFIG, tmp_path / "first", Start(), stop=6)
-    second = fit(CONFIG, tmp_path / "second", Start(init=first, step=6))
+    first = fit(CONFIG, tmp_path / "first", Start(), stop=3)
+    second = fit(CONFIG, tmp_path / "second", Start(init=first, step=3))
     log = (tmp_path / "second" / "log.jsonl").read_text().splitlines()
-    assert json.loads(log[-2])["step"] == 10
+    assert json.loads(log[-2])["step"] == 6
     assert load_model(second).config == CONFIG.network
 
 
@@ -280,22 +266,19 @@ def test_what_cannot_be_started_from_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "empty").exists()
 
 
-def test_a_damaged_checkpoint_is_an_error(tmp_path: Path) -> None:
-    fit(CONFIG, tmp_path / "run", Start(), stop=1)
-    file = tmp_path / "run" / "checkpoint.pt"
+def test_a_damaged_checkpoint_is_an_error(copy: Path) -> None:
+    file = copy / "checkpoint.pt"
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(UserError, match=r"checkpoint is damaged .*checkpoint.pt"):
-        fit(CONFIG, tmp_path / "run", Start(resume=True))
+        fit(CONFIG, copy, Start(resume=True))
 
 
-def test_a_checkpoint_of_a_network_of_before_is_an_error(tmp_path: Path) -> None:
-    fit(CONFIG, tmp_path / "run", Start(), stop=1)
-    file = tmp_path / "run" / "checkpoint.pt"
-    content = torch.load(file, weights_only=True)
+def test_a_checkpoint_of_a_network_of_before_is_an_error(copy: Path) -> None:
+    file, content = copy / "checkpoint.pt", read_checkpoint(copy)
     del content["model"]["judge.correction.0.weight"]
     torch.save(content, file)
     with pytest.raises(UserError, match=r"another version .*judge.*--init .*weights.safetensors"):
-        fit(CONFIG, tmp_path / "run", Start(resume=True))
+        fit(CONFIG, copy, Start(resume=True))
 
 
 def test_steps_see_every_room_once_an_epoch_and_continue_anywhere() -> None:
