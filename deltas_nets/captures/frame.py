@@ -16,6 +16,7 @@ from deltas_nets.captures.images import (
     header_of,
     header_of_whole_file,
     in_words,
+    resize_image,
 )
 from deltas_nets.errors import UserError
 
@@ -61,7 +62,7 @@ class Frame:
     depth_scale: float = MILLIMETRES
     """Steps of the depth image in a metre, where it holds whole numbers."""
     lens: Lens | None = None
-    """None where straight lines are straight; images with another lens are refused."""
+    """None where straight lines are straight."""
     image_span: Span | None = None
     """Which bytes of ``image_path`` are the image; None for the whole file."""
     depth_span: Span | None = None
@@ -73,15 +74,18 @@ class Frame:
         """Decode the whole image, or take it from the memory.
 
         Returns:
-            ``(H, W, 3)`` RGB of ``image_size``, not to be written to.
+            ``(H, W, 3)`` RGB of ``image_size``, not to be written to; the lens is not undone.
 
         Raises:
-            UserError: the file is missing, damaged, truncated, not 8-bit, or of another size, or
-                its lens bends straight lines.
+            UserError: the file is missing, damaged, truncated, not 8-bit, or of another size.
         """
         if self.memory is None:
             return self._decode_image()
         return self.memory.get((self.image_path, self.image_span), self._decode_image)
+
+    def read_resized(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """The image ``(h, w, 3)`` at another size; see :func:`resize_image`."""
+        return resize_image(self.read_image(), size)
 
     def check_image(self) -> None:
         """Raise what :meth:`read_image` would; decode only where the file's header cannot tell.
@@ -131,10 +135,6 @@ class Frame:
         return pixels
 
     def _check_image(self, header: Header) -> None:
-        if self.lens is not None:
-            numbers = " ".join(f"{number:g}" for number in self.lens.coefficients)
-            what = f"the image is of a lens that bends lines ({self.lens.model} {numbers})"
-            raise UserError(what, self.image_path, "undistort images and intrinsics first")
         if header.mode.startswith(("I", "F")):
             # Pillow would clip these to white without a word.
             what = f"image has pixels of type {header.mode}, not 8-bit colour"

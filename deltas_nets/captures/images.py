@@ -23,6 +23,7 @@ __all__ = [
     "image_size_of",
     "in_words",
     "open_span",
+    "resize_image",
 ]
 
 _END_OF_JPEG = b"\xff\xd9"
@@ -144,3 +145,17 @@ def in_words(size: tuple[int, int]) -> str:
         '640x480'
     """
     return f"{size[1]}x{size[0]}"
+
+
+def resize_image(image: NDArray[np.uint8], new_size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize ``(H, W, 3)`` with antialiasing; the image keeps spanning the same field of view.
+
+    Lanczos, because its weights follow the fractional position of each new pixel. Pillow's
+    BOX takes or leaves whole pixels, so at 540 -> 320 content jumps by up to half a pixel,
+    which the network would take for parallax.
+    """
+    height, width = new_size
+    if image.shape[:2] == (height, width):
+        return image.copy()  # writable, and not a view of a decoder's buffer
+    resized = Image.fromarray(image).resize((width, height), Image.Resampling.LANCZOS)
+    return np.array(resized)

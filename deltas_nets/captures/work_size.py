@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_intrinsics
@@ -18,7 +17,6 @@ __all__ = [
     "fit_work_size",
     "load_image",
     "load_views",
-    "resize_image",
 ]
 
 SMALLEST_BASELINE = 1e-6
@@ -50,7 +48,7 @@ def load_image(frame: Frame, *, work_size: tuple[int, int]) -> Tensor:
     Raises:
         UserError: it cannot be read.
     """
-    pixels = resize_image(frame.read_image(), work_size)
+    pixels = frame.read_resized(work_size)
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().float() / 255
 
 
@@ -77,20 +75,6 @@ def anchor_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> Pose
         poses.append(torch.from_numpy(cam_from_anchor))
     poses[0] = torch.eye(4, dtype=torch.float64)  # exactly, not but for rounding
     return PosedViews(torch.stack(intrinsics).float(), torch.stack(poses).float())
-
-
-def resize_image(image: NDArray[np.uint8], new_size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize ``(H, W, 3)`` with antialiasing; the image keeps spanning the same field of view.
-
-    Lanczos, because its weights follow the fractional position of each new pixel. Pillow's
-    BOX takes or leaves whole pixels, so at 540 -> 320 content jumps by up to half a pixel,
-    which the network would take for parallax.
-    """
-    height, width = new_size
-    if image.shape[:2] == (height, width):
-        return image.copy()  # writable, and not a view of a decoder's buffer
-    resized = Image.fromarray(image).resize((width, height), Image.Resampling.LANCZOS)
-    return np.array(resized)
 
 
 def fit_work_size(

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from deltas_geom import PosedViews, unproject
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.view_sets import ViewSet
-from deltas_nets.captures.work_size import resize_image
 from deltas_nets.network.deltas import DepthPrediction
 
 
@@ -105,7 +104,7 @@ def point_cloud(
     ).resize(old_size=anchor.image_size, new_size=size)
     pixels = torch.from_numpy(np.stack([columns, rows], axis=-1)).double()
     points = unproject(view, pixels[None], z[None])[0]
-    colors = resize_image(anchor.read_image(), size)[rows, columns]
+    colors = anchor.read_resized(size)[rows, columns]
     known = z.numpy() > 0
     in_world: NDArray[np.float64] = points.numpy()[known]
     return in_world, colors[known]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from deltas_nets.captures.capture import Frame
+from deltas_nets.captures.images import Span
 from deltas_nets.captures.work_size import load_image
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.encoded import Encoded
@@ -16,7 +17,7 @@ from deltas_nets.network.encoded import Encoded
 CAPACITY = 24
 """Frames that are kept: 15 MB each at the default size."""
 
-_Key = tuple[Path, tuple[int, int]]
+_Key = tuple[Path, Span | None, tuple[int, int]]
 
 
 class EncodedImages(NamedTuple):
@@ -55,7 +56,7 @@ class EncodedFrames:
         Raises:
             UserError: an image cannot be read.
         """
-        keys = [(frame.image_path, work_size) for frame in frames]
+        keys = [(frame.image_path, frame.image_span, work_size) for frame in frames]
         new = {
             key: frame for key, frame in zip(keys, frames, strict=True) if key not in self._known
         }

@@ -12,9 +12,10 @@ from PIL import Image
 
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.images import resize_image
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.view_sets import read_view_sets
-from deltas_nets.captures.work_size import depth_at_image, fit_work_size, load_views, resize_image
+from deltas_nets.captures.work_size import depth_at_image, fit_work_size, load_views
 
 MakeCapture = Callable[..., Path]
 

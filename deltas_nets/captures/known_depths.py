@@ -1,0 +1,69 @@
+"""How far away a frame's surfaces are, as far as the capture knows before any network looks."""
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
+
+__all__ = ["depths_of_points", "depths_of_sensor", "known_depths", "typical_depths"]
+
+ENOUGH = 20
+"""Points that tell what a frame shows; fewer may all be on one thing."""
+SOME = 2000
+"""Pixels of sensor depth that are looked at."""
+
+
+def known_depths(capture: Capture, position: int) -> FloatArray | None:
+    """Depths of a frame's sparse points, or of its sensor; in the capture's unit.
+
+    Args:
+        capture: the frames.
+        position: of the frame among them.
+
+    Returns:
+        ``(D,)`` positive, in no order; None where the capture knows too little.
+    """
+    depths = depths_of_points(capture, position)
+    return depths_of_sensor(capture, position) if depths is None else depths
+
+
+def depths_of_points(capture: Capture, position: int) -> FloatArray | None:
+    """Depths of the sparse points that a frame sees, or would see where no one says so."""
+    points = capture.points
+    if points is None:
+        return None
+    told = len(points.seen.frame) > 0
+    xyz = points.xyz[points.of_frame(position)] if told else points.xyz
+    pose = capture.frames.cam_from_world[position]
+    in_camera = xyz @ pose[:3, :3].T + pose[:3, 3]
+    in_camera = in_camera[in_camera[:, 2] > 0]
+    if not told:
+        x, y, w = (in_camera @ capture.frames.K[position].T).T
+        height, width = capture.frames.image_sizes[position]
+        in_camera = in_camera[(abs(2 * x / w - width) < width) & (abs(2 * y / w - height) < height)]
+    return in_camera[:, 2] if len(in_camera) >= ENOUGH else None
+
+
+def depths_of_sensor(capture: Capture, position: int) -> FloatArray | None:
+    """Some of the depths that a sensor measured.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    frame = capture.frames.at(position)
+    if frame.depth_path is None:
+        return None
+    depth = frame.read_depth()
+    known = depth[depth > 0].astype(np.float64)
+    return known[:: 1 + len(known) // SOME] if len(known) >= ENOUGH else None
+
+
+def typical_depths(capture: Capture) -> FloatArray:
+    """``(F,)`` median depth of what each frame shows, by its sparse points; NaN where unknown."""
+    found = np.full(len(capture.frames), np.nan)
+    if capture.points is not None:
+        for position in range(len(found)):
+            depths = depths_of_points(capture, position)
+            if depths is not None:
+                found[position] = np.median(depths)
+    return found

@@ -1,0 +1,159 @@
+"""A lens that bends lines, straightened for the network, and maps bent back onto the photo."""
+
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from deltas_geom import Lens
+from deltas_geom.cameras.pixels import normalize_pixels, pixel_grid, resize_intrinsics
+from deltas_geom.cameras.projection import pixel_rays
+from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.frame import Lens as FrameLens
+from deltas_nets.captures.images import resize_image
+
+__all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight"]
+
+WIDEST = np.cos(np.radians(55))
+"""What a lens sees farther off its axis is left out: a straight image of it would be all border."""
+_ACROSS = 33  # pixels of the photo, along each side, that the straight image is made to hold
+_FINER = 2  # times the wanted size, at which an image is straightened before it is made smaller
+
+
+@dataclass(frozen=True, eq=False)
+class StraightFrame(Frame):
+    """A frame as a pinhole camera in the lens's place would have taken it: K and size are its."""
+
+    photo: Frame = field(kw_only=True)
+    """As it was taken."""
+
+    def read_image(self) -> NDArray[np.uint8]:
+        """Decode the photo and straighten it; what the lens did not see repeats the border."""
+        return self._straightened(self.photo.read_image(), self.image_size)
+
+    def read_resized(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Straighten the photo at about the size that is wanted."""
+        finer = (_FINER * size[0], _FINER * size[1])
+        pixels = self.photo.read_image()
+        share = max(finer[0] / self.image_size[0], finer[1] / self.image_size[1])
+        if share < 1:
+            height, width = self.photo.image_size
+            pixels = resize_image(pixels, (round(share * height), round(share * width)))
+            return resize_image(self._straightened(pixels, finer), size)
+        return resize_image(self._straightened(pixels, self.image_size), size)
+
+    def _straightened(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+        """A photo of any size, as a straight image of any size."""
+        given = (pixels.shape[0], pixels.shape[1])
+        image = torch.from_numpy(pixels.copy()).permute(2, 0, 1).float()
+        grid = _grid(
+            _Seen.of(self.photo), given, _Straight(self.K.tobytes(), self.image_size), size
+        )
+        seen = F.grid_sample(image[None], grid, padding_mode="border", align_corners=False)[0]
+        straightened: NDArray[np.uint8] = seen.round().byte().permute(1, 2, 0).numpy()
+        return straightened
+
+
+class _Seen(NamedTuple):
+    """What tells a photo's camera from others: a capture has few."""
+
+    K: bytes
+    lens: FrameLens
+    image_size: tuple[int, int]
+
+    @classmethod
+    def of(cls, photo: Frame) -> "_Seen":
+        """The camera of a photo."""
+        assert photo.lens is not None
+        return cls(photo.K.tobytes(), photo.lens, photo.image_size)
+
+    def resized(self, size: tuple[int, int]) -> Lens:
+        """The lens for photos of a size."""
+        K = torch.tensor(np.frombuffer(self.K).reshape(3, 3))
+        coefficients = torch.tensor(self.lens.coefficients, dtype=torch.float64)
+        at_size = resize_intrinsics(K, old_size=self.image_size, new_size=size)
+        return Lens(at_size, coefficients, self.lens.model)
+
+
+class _Straight(NamedTuple):
+    """A pinhole camera."""
+
+    K: bytes
+    image_size: tuple[int, int]
+
+    def resized(self, size: tuple[int, int]) -> torch.Tensor:
+        """``(3, 3)`` for images of a size."""
+        K = torch.tensor(np.frombuffer(self.K).reshape(3, 3))
+        return resize_intrinsics(K, old_size=self.image_size, new_size=size)
+
+
+@lru_cache(maxsize=4)
+def _grid(
+    seen: _Seen, photo_size: tuple[int, int], camera: _Straight, size: tuple[int, int]
+) -> torch.Tensor:
+    """``(1, H, W, 2)`` where a straight image of a size reads a photo of another."""
+    rays = pixel_rays(camera.resized(size), pixel_grid(size, dtype=torch.float64))
+    pixels = seen.resized(photo_size).project(rays).pixels
+    return normalize_pixels(pixels, image_size=photo_size).float().reshape(1, *size, 2)
+
+
+@lru_cache(maxsize=2)
+def _places(seen: _Seen, camera: _Straight, size: tuple[int, int]) -> NDArray[np.int64]:
+    rays, valid = seen.resized(size).unproject(pixel_grid(size, dtype=torch.float64))
+    ahead = valid & (rays[:, 2] > 0)
+    x, y, w = (torch.where(ahead[:, None], rays, 0.0) @ camera.resized(camera.image_size).mT).T
+    depth = torch.where(ahead, w, 1.0)
+    column, row = (x / depth).round().long(), (y / depth).round().long()
+    height, width = camera.image_size
+    inside = ahead & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return torch.where(inside, row * width + column, -1).reshape(size).numpy()
+
+
+def straight(frame: Frame) -> Frame:
+    """The frame itself where straight lines are straight in it, else a `StraightFrame`."""
+    if frame.lens is None:
+        return frame
+    K, size = _straight_camera(frame)
+    same = {part.name: getattr(frame, part.name) for part in fields(Frame)}
+    return StraightFrame(**same | {"K": K, "image_size": size, "lens": None}, photo=frame)
+
+
+def _straight_camera(photo: Frame) -> tuple[FloatArray, tuple[int, int]]:
+    """A pinhole camera that sees what the lens does, as finely as at its middle or less."""
+    height, width = photo.image_size
+    rows, columns = np.mgrid[0 : 1 : _ACROSS * 1j, 0 : 1 : _ACROSS * 1j].reshape(2, -1)
+    pixels = np.stack([columns * width - 0.5, rows * height - 0.5], axis=-1)
+    seen = _Seen.of(photo).resized(photo.image_size).unproject(torch.from_numpy(pixels))
+    rays = seen.rays[seen.valid & (seen.rays[:, 2] > WIDEST)].numpy()
+    slopes = rays[:, :2] / rays[:, 2:]
+    low, high = slopes.min(axis=0), slopes.max(axis=0)
+    # Pixels keep their shape, and the image is as wide as the photo.
+    focal = np.diag(photo.K)[:2] * (width / (high - low)[0] / photo.K[0, 0])
+    size = (max(1, round(focal[1] * (high - low)[1])), width)
+    centre = (np.array(size[::-1]) - 1) / 2 - focal * (low + high) / 2
+    K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    return K, size
+
+
+def pixels_of_photo(frame: StraightFrame, size: tuple[int, int]) -> NDArray[np.int64]:
+    """For each pixel of the photo, resized to ``size``, the straight image's pixel.
+
+    Returns:
+        ``(H, W)`` places in the flattened straight image; -1 where that does not show it.
+    """
+    camera = _Straight(frame.K.tobytes(), frame.image_size)
+    return _places(_Seen.of(frame.photo), camera, size)
+
+
+def photo_pixels(
+    frame: StraightFrame, pixels: torch.Tensor, size: tuple[int, int], photo_size: tuple[int, int]
+) -> torch.Tensor:
+    """Where pixels ``(N, 2)`` of the straight image, at a size, are in the photo at another."""
+    camera = _Straight(frame.K.tobytes(), frame.image_size)
+    rays = pixel_rays(camera.resized(size), pixels.double().cpu())
+    seen = _Seen.of(frame.photo).resized(photo_size).project(rays).pixels
+    return seen.to(pixels)

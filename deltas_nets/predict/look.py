@@ -1,0 +1,85 @@
+"""What a network makes of frames as they are: in any unit, through any lens."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, resized
+from deltas_nets.predict.predictor import Predictor
+from deltas_nets.predict.reach import Reach
+
+__all__ = ["found_depths", "look"]
+
+
+def look(
+    predictor: Predictor, frames: Sequence[Frame], config: PredictConfig, reach: Reach
+) -> DepthMap:
+    """Depth of the first frame, as its photo shows it, in the capture's unit.
+
+    Args:
+        predictor: of a trained network.
+        frames: the anchor and its sources.
+        config: all but the range.
+        reach: what is searched.
+
+    Raises:
+        UserError: an image cannot be read.
+    """
+    unit = reach.unit
+    config = replace(config, depth_range=(reach.near * unit, reach.far * unit))
+    seen = [_in_unit(straight(frame), unit) for frame in frames]
+    anchor = seen[0]
+    if isinstance(anchor, StraightFrame):
+        size = config.size or anchor.photo.image_size
+        found = predictor.depth_map(seen, replace(config, size=None))
+        found = _as_photographed(found, anchor, size)
+    else:
+        found = predictor.depth_map(seen, config)
+    return found if unit == 1 else _in_units_of_capture(found, unit)
+
+
+def found_depths(found: DepthMap) -> FloatArray:
+    """Depths ``(D,)`` of the triangulated points of a map."""
+    depths: FloatArray = found.keypoints.depth.double().cpu().numpy()
+    return depths[depths > 0]
+
+
+def _in_unit(frame: Frame, unit: float) -> Frame:
+    if unit == 1:
+        return frame
+    pose = frame.cam_from_world.copy()
+    pose[:3, 3] *= unit
+    return replace(frame, cam_from_world=pose)
+
+
+def _in_units_of_capture(found: DepthMap, unit: float) -> DepthMap:
+    return found._replace(
+        depth=found.depth / np.float32(unit),
+        points=found.points / unit,
+        keypoints=found.keypoints._replace(depth=found.keypoints.depth / unit),
+    )
+
+
+def _as_photographed(found: DepthMap, anchor: StraightFrame, size: tuple[int, int]) -> DepthMap:
+    """The map of a straight image, for the pixels of the photo; 0 beyond what that shows."""
+    place = pixels_of_photo(anchor, size)
+    outside = place < 0
+    depth = np.where(outside, np.float32(0), found.depth.ravel()[place])
+    confidence = found.confidence
+    if confidence is not None:
+        confidence = np.where(outside, np.float32(0), confidence.ravel()[place])
+    log_std = found.log_std
+    if log_std is not None:
+        log_std = torch.from_numpy(resized(log_std, anchor.image_size).ravel()[place])[None]
+    keypoints = found.keypoints
+    at = photo_pixels(anchor, keypoints.pixels, keypoints.image_size, size)
+    return found._replace(
+        depth=depth,
+        confidence=confidence,
+        keypoints=keypoints._replace(pixels=at, image_size=size),
+        log_std=log_std,
+    )

@@ -1,0 +1,119 @@
+"""Depth searched where surfaces are: as the capture says, or as a first look does."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.known_depths import known_depths
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, frames_of
+from deltas_nets.predict.look import found_depths, look
+from deltas_nets.predict.predictor import Predictor
+from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of, wider
+
+__all__ = ["Asked", "Followed", "Found", "Search"]
+
+FIRST_BASELINE = 0.2
+"""Metres that the network takes the way between two views for, where nothing tells the unit."""
+FIRST_RANGE = (0.2, 60.0)
+"""Searched first then: 1 to 300 times that way."""
+LOOKS = 4
+"""At most; each but the last found that the search was too short."""
+
+
+class Found(NamedTuple):
+    """A map, and how it was searched for.
+
+    Attributes:
+        map: in the capture's unit.
+        reach: of the last search.
+        piled: the end of it, "near" or "far", at which points pile up all the same.
+    """
+
+    map: DepthMap
+    reach: Reach
+    piled: str | None
+
+
+class Search(Protocol):
+    """How a frame's depth is searched."""
+
+    def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
+        """The map of a view set; all but the range is the config's.
+
+        Raises:
+            UserError: an image cannot be read.
+        """
+
+
+class Asked:
+    """A search in a range that the user states.
+
+    Args:
+        capture: the frames.
+        depth_range: nearest and farthest depth, in the capture's unit.
+    """
+
+    def __init__(self, capture: Capture, depth_range: tuple[float, float]) -> None:
+        near, far = depth_range
+        unit = 1.0 if capture.metric else (ROOM[0] * ROOM[1] / (near * far)) ** 0.5
+        self.capture, self.reach = capture, Reach(near, far, unit)
+
+    def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
+        """See `Search`."""
+        found = look(predictor, frames_of(self.capture, views), config, self.reach)
+        return Found(found, self.reach, end_of_pile(found_depths(found), self.reach))
+
+
+class Followed:
+    """A search that follows from the capture: its sparse points, its sensor, or a first look.
+
+    Args:
+        capture: the frames.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture = capture
+        self._position = {id: position for position, id in enumerate(capture.frames)}
+
+    def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
+        """See `Search`."""
+        frames = frames_of(self.capture, views)
+        metric = self.capture.metric
+        known = known_depths(self.capture, self._position[views.anchor])
+        if known is not None:
+            reach, sure = reach_of(known, metric=metric), True
+        elif metric:
+            reach, sure = Reach(*ROOM), True
+        else:
+            reach, sure = _by_baseline(frames), False
+        for _ in range(LOOKS - 1):
+            found = look(predictor, frames, config, reach)
+            depths = found_depths(found)
+            piled = end_of_pile(depths, reach)
+            if sure and piled is None:
+                return Found(found, reach, None)
+            if piled is not None:
+                reach, sure = wider(reach, piled), False
+            elif len(depths):
+                reach, sure = reach_of(depths, metric=metric), True
+            else:
+                break
+        found = look(predictor, frames, config, reach)
+        return Found(found, reach, end_of_pile(found_depths(found), reach))
+
+
+def _by_baseline(frames: Sequence[Frame]) -> Reach:
+    """A wide search, of a world in which the cameras stand as usual."""
+    centres = np.array([_centre(frame) for frame in frames])
+    apart = float(np.median(np.linalg.norm(centres[1:] - centres[0], axis=-1)))
+    unit = FIRST_BASELINE / apart if apart > 0 else 1.0
+    return Reach(FIRST_RANGE[0] / unit, FIRST_RANGE[1] / unit, unit)
+
+
+def _centre(frame: Frame) -> FloatArray:
+    centre: FloatArray = -frame.cam_from_world[:3, :3].T @ frame.cam_from_world[:3, 3]
+    return centre
