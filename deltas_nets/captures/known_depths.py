@@ -5,7 +5,7 @@ import numpy as np
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 
-__all__ = ["depths_of_points", "depths_of_sensor", "known_depths", "typical_depths"]
+__all__ = ["depths_of_sensor", "known_depths", "points_in_view", "typical_depths"]
 
 ENOUGH = 20
 """Points that tell what a frame shows; fewer may all be on one thing."""
@@ -23,25 +23,33 @@ def known_depths(capture: Capture, position: int) -> FloatArray | None:
     Returns:
         ``(D,)`` positive, in no order; None where the capture knows too little.
     """
-    depths = depths_of_points(capture, position)
-    return depths_of_sensor(capture, position) if depths is None else depths
+    points = points_in_view(capture, position)
+    return depths_of_sensor(capture, position) if points is None else points[:, 2]
 
 
-def depths_of_points(capture: Capture, position: int) -> FloatArray | None:
-    """Depths of the sparse points that a frame sees, or would see where no one says so."""
+def points_in_view(capture: Capture, position: int) -> FloatArray | None:
+    """Sparse points that a frame sees, or would see where no one says so, in its camera's axes.
+
+    Args:
+        capture: the frames.
+        position: of the frame among them.
+
+    Returns:
+        ``(D, 3)`` in front of it; None where there are too few.
+    """
     points = capture.points
     if points is None:
         return None
     told = len(points.seen.frame) > 0
     xyz = points.xyz[points.of_frame(position)] if told else points.xyz
     pose = capture.frames.cam_from_world[position]
-    in_camera = xyz @ pose[:3, :3].T + pose[:3, 3]
-    in_camera = in_camera[in_camera[:, 2] > 0]
+    found = xyz @ pose[:3, :3].T + pose[:3, 3]
+    found = found[found[:, 2] > 0]
     if not told:
-        x, y, w = (in_camera @ capture.frames.K[position].T).T
+        x, y, w = (found @ capture.frames.K[position].T).T
         height, width = capture.frames.image_sizes[position]
-        in_camera = in_camera[(abs(2 * x / w - width) < width) & (abs(2 * y / w - height) < height)]
-    return in_camera[:, 2] if len(in_camera) >= ENOUGH else None
+        found = found[(abs(2 * x / w - width) < width) & (abs(2 * y / w - height) < height)]
+    return found if len(found) >= ENOUGH else None
 
 
 def depths_of_sensor(capture: Capture, position: int) -> FloatArray | None:
@@ -63,7 +71,7 @@ def typical_depths(capture: Capture) -> FloatArray:
     found = np.full(len(capture.frames), np.nan)
     if capture.points is not None:
         for position in range(len(found)):
-            depths = depths_of_points(capture, position)
-            if depths is not None:
-                found[position] = np.median(depths)
+            points = points_in_view(capture, position)
+            if points is not None:
+                found[position] = np.median(points[:, 2])
     return found

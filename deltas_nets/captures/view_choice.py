@@ -1,21 +1,25 @@
 """Which frames are looked at together, chosen by geometry where no file says it."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture, FloatArray
-from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.known_depths import points_in_view
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.working_depth import working_depths
 from deltas_nets.errors import UserError
 
-__all__ = ["choose_view_sets", "spread_sources"]
+__all__ = ["ChosenViews", "choose_view_sets", "choose_views", "spread_sources"]
 
 PROBE_DEPTHS = (0.4, 0.8, 1.6)
 """Where surfaces may be, in working depths: overlap is the mean over these."""
 PROBES_ACROSS = 8  # columns and rows of anchor pixels probed
+MAX_POINTS = 256  # sparse points that are probed in their place where the anchor sees some
 
 GOOD_BASELINES = (0.06, 0.10)
 """In working depths. Below, half a pixel of matching error is too much depth; above, patches
@@ -25,14 +29,27 @@ MIN_BASELINE = 0.01
 MIN_OVERLAP = 0.4
 MAX_ANGLE = np.radians(45)
 GOOD_ANGLE = np.radians(15)  # where the penalty of the viewing angle reaches exp(-1/2)
+NEAREST = 0.04  # in working depths; what is nearer to a candidate does not count as seen
 MAX_CANDIDATES = 48  # frames scored by projection for each anchor
+
+
+class ChosenViews(NamedTuple):
+    """What was chosen.
+
+    Attributes:
+        view_sets: one for each anchor.
+        short: how many sets have fewer views than asked, by what hinders most other frames.
+    """
+
+    view_sets: tuple[ViewSet, ...]
+    short: Mapping[str, int]
 
 
 def choose_view_sets(
     capture: Capture,
     num_views: int,
     *,
-    working_depth: float = 2.5,
+    working_depth: float | None = None,
     anchors: Iterable[str | int] | None = None,
 ) -> tuple[ViewSet, ...]:
     """Choose sources for every frame by baseline, viewing angle and overlap.
@@ -43,11 +60,27 @@ def choose_view_sets(
     Args:
         capture: two frames or more.
         num_views: the anchor and at most ``num_views - 1`` sources.
-        working_depth: metres to typical surfaces; good baselines are 6 to 10 % of it.
+        working_depth: how far typical surfaces are, in the capture's unit: good baselines are 6 to
+            10 % of it. Of each frame as `deltas_nets.captures.working_depth` says if not given.
         anchors: frames that want a set; all by default.
 
     Raises:
         UserError: the capture has one frame only, or an anchor that it does not have.
+    """
+    return choose_views(capture, num_views, working_depth=working_depth, anchors=anchors).view_sets
+
+
+def choose_views(
+    capture: Capture,
+    num_views: int,
+    *,
+    working_depth: float | None = None,
+    anchors: Iterable[str | int] | None = None,
+) -> ChosenViews:
+    """:func:`choose_view_sets`, and why sets are short.
+
+    Raises:
+        UserError: as there.
     """
     if num_views < 2:
         what = f"{num_views} views are too few"
@@ -58,24 +91,28 @@ def choose_view_sets(
     ids = list(capture.frames)
     index_of = {id: index for index, id in enumerate(ids)}
     wanted = ids if anchors is None else [capture.frame(id).id for id in anchors]
-    frames = capture.frames
-    poses = frames.cam_from_world
+    depths = working_depths(capture) if working_depth is None else None
+    poses = capture.frames.cam_from_world
     centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
 
-    view_sets = []
+    view_sets, short = [], Counter[str]()
     for id in wanted:
         anchor = index_of[id]
-        near = _candidates(centres, poses[:, 2, :3], anchor, working_depth)
-        overlap = _overlap(frames, anchor, near, working_depth)
+        depth = float(depths[anchor]) if depths is not None else working_depth or 0.0
+        near = _candidates(centres, poses[:, 2, :3], anchor, depth)
+        overlap = _overlap(capture, anchor, near, depth)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
         angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
-        log_score, acceptable = _rate(offsets, angles, overlap, working_depth)
+        log_score, hindered = _rate(offsets, angles, overlap, depth)
+        acceptable = hindered == ""
+        if acceptable.sum() < min(num_views, len(ids)) - 1:
+            short[Counter(hindered[~acceptable]).most_common(1)[0][0]] += 1
         if acceptable.any():
             near, offsets = near[acceptable], offsets[acceptable]
             log_score = log_score[acceptable]
         chosen = spread_sources(log_score, offsets, num_views - 1)
         view_sets.append(ViewSet(id, tuple(ids[near[index]] for index in chosen)))
-    return tuple(view_sets)
+    return ChosenViews(tuple(view_sets), dict(short.most_common()))
 
 
 def _candidates(
@@ -115,17 +152,24 @@ def _baseline_log_score(baseline: FloatArray) -> FloatArray:
     return score
 
 
-def _overlap(
-    frames: Frames, anchor: int, near: NDArray[np.intp], working_depth: float
-) -> FloatArray:
-    """Part of the anchor's image that each candidate sees, over the probed depths, (C,)."""
-    height, width = frames.image_sizes[anchor]
+def _probes(capture: Capture, anchor: int, working_depth: float) -> FloatArray:
+    """Places ``(3, P)`` in the anchor's camera where surfaces are, or may be."""
+    points = points_in_view(capture, anchor)
+    if points is not None:
+        return points[:: 1 + len(points) // MAX_POINTS].T
+    height, width = capture.frames.image_sizes[anchor]
     parts = (np.arange(PROBES_ACROSS) + 0.5) / PROBES_ACROSS
     x, y = np.meshgrid(parts * width - 0.5, parts * height - 0.5)
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    rays = np.linalg.inv(frames.K[anchor]) @ pixels
-    points = np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
+    rays = np.linalg.inv(capture.frames.K[anchor]) @ pixels
+    return np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
 
+
+def _overlap(
+    capture: Capture, anchor: int, near: NDArray[np.intp], working_depth: float
+) -> FloatArray:
+    """Part of what the anchor sees, at the probes, that each candidate sees, (C,)."""
+    frames, points = capture.frames, _probes(capture, anchor, working_depth)
     poses = frames.cam_from_world
     rotation, shift = poses[anchor, :3, :3], poses[anchor, :3, 3:]
     # Relative poses first: with the world's origin kilometres away the sums would cancel.
@@ -133,7 +177,7 @@ def _overlap(
     seen = turns @ points + (poses[near, :3, 3:] - turns @ shift)
     projected = frames.K[near] @ seen
     depth = projected[:, 2]
-    in_front = depth > 0.1
+    in_front = depth > NEAREST * working_depth
     safe = np.where(in_front, depth, 1.0)
     column, row = projected[:, 0] / safe, projected[:, 1] / safe
     sizes = frames.image_sizes[near].astype(np.float64)
@@ -146,17 +190,25 @@ def _overlap(
 
 def _rate(
     offsets: FloatArray, angles: FloatArray, overlap: FloatArray, working_depth: float
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Log scores of candidates and whether they are acceptable; offsets in the anchor's axes."""
+) -> tuple[FloatArray, NDArray[np.str_]]:
+    """Log scores of candidates and what makes them unfit, "" if nothing; in the anchor's axes."""
     baseline = np.linalg.norm(offsets, axis=-1) / working_depth
     # Parallax comes from moving sideways; moving along the view leaves its centre without any.
     sideways = np.linalg.norm(offsets[:, :2], axis=-1) / working_depth
     effective = np.sqrt(sideways**2 + 0.25 * (offsets[:, 2] / working_depth) ** 2)
     score = _baseline_log_score(effective)
     score = score - 0.5 * (angles / GOOD_ANGLE) ** 2 + 2.0 * np.log(np.maximum(overlap, 1e-3))
-    acceptable = (baseline >= MIN_BASELINE) & (baseline <= MAX_BASELINE)
-    acceptable &= (overlap >= MIN_OVERLAP) & (angles <= MAX_ANGLE)
-    return score, acceptable
+    hindered = np.select(
+        [
+            baseline < MIN_BASELINE,
+            baseline > MAX_BASELINE,
+            angles > MAX_ANGLE,
+            overlap < MIN_OVERLAP,
+        ],
+        ["stand in the same place", "stand too far away", "look elsewhere", "see little of it"],
+        default="",
+    )
+    return score, hindered
 
 
 def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> list[int]:
