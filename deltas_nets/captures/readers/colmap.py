@@ -6,6 +6,7 @@ the same in another way.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -47,21 +48,23 @@ def read(path: Path) -> Capture:
     """Read a model and find its images; see `deltas_nets.captures.opening.Reader`."""
     found = find_models(path)
     most = found.models[0][1]
-    best = [
-        (folder, model, _find_images(folder, model, found.capture))
-        for folder, model in (
-            (folder, read_model(folder)) for folder, n in found.models if n == most
-        )
-    ]
-    folder, model, images = max(
-        best, key=lambda tried: sum(image is not None for image in tried[2])
-    )
-    capture = capture_of_model(model, images, folder, found.capture)
+    tried = []
+    for capture, (folder, count) in product(found.captures, found.models):
+        if count == most:
+            model = read_model(folder)
+            images = _find_images(folder, model, capture)
+            tried.append(
+                (sum(image is not None for image in images), folder, model, images, capture)
+            )
+            if tried[-1][0] == len(images):
+                break
+    _, folder, model, images, capture = max(tried, key=lambda each: each[0])
+    read = capture_of_model(model, images, folder, capture)
     rest = [f"{other.name} ({count})" for other, count in found.models if other != folder]
     if not rest:
-        return capture
+        return read
     doubt = f"{folder} with {most} images is read; there are other models: {ids_in_words(rest)}"
-    return replace(capture, doubts=(doubt, *capture.doubts))
+    return replace(read, doubts=(doubt, *read.doubts))
 
 
 def _find_images(folder: Path, model: ColmapModel, capture: Path) -> list[Path | None]:
@@ -86,6 +89,8 @@ def capture_of_model(
         UserError: an image's camera is missing or is none, or its files are of another shape.
     """
     file = _file(folder, "images")
+    if not model.images.names:
+        raise UserError("the model has no images", file, "estimate poses with COLMAP first")
     ids = _ids(model.images.names, file)
     cameras = _cameras(model, images, folder)
     rotations = rotations_of(model.images.quaternions)

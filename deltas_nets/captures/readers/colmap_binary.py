@@ -151,11 +151,12 @@ def _starts_of_points(file: _Bytes, count: int) -> NDArray[np.int64]:
     data, place, end = file.data, file.place, len(file.data)
     unpack, ahead = COUNT.unpack_from, POINT.itemsize - COUNT.size
     for index in range(count):
+        # Before the place is kept: a track's length may be any number of 64 bits.
+        if place + POINT.itemsize > end:
+            break
         starts[index] = place
-        place += POINT.itemsize
-        if place > end:
-            raise UserError("the file is cut short", file.path, REMEDY)
-        place += 8 * unpack(data, place - POINT.itemsize + ahead)[0]
-    if place > end:
-        raise UserError("the file is cut short", file.path, REMEDY)
-    return starts
+        place += POINT.itemsize + 8 * unpack(data, place + ahead)[0]
+    else:
+        if place <= end:
+            return starts
+    raise UserError("the file is cut short or damaged", file.path, REMEDY)

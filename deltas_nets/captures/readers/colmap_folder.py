@@ -28,11 +28,11 @@ class FoundModels(NamedTuple):
     """Models of one capture.
 
     Attributes:
-        capture: the folder that the images are in.
+        captures: folders that the images may be in, best first.
         models: folders and the number of their images, most first.
     """
 
-    capture: Path
+    captures: tuple[Path, ...]
     models: tuple[tuple[Path, int], ...]
 
 
@@ -65,7 +65,8 @@ def find_models(path: Path) -> FoundModels:
     counts = [(model, _count_images(model)) for model in models]
     # Sorting is stable: of models that are as good, the first.
     counts.sort(key=lambda counted: -counted[1])
-    return FoundModels(captures[0], tuple(counts))
+    around = (start,) if captures[0].is_relative_to(start) and captures[0] != start else ()
+    return FoundModels((captures[0], *around), tuple(counts))
 
 
 def read_model(folder: Path) -> ColmapModel:
