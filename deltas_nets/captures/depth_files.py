@@ -101,8 +101,9 @@ def _bytes(stored: StoredDepth) -> bytes:
             raise UserError(what, stored.path, "export depth as a 16-bit grey PNG")
         with open_span(stored.path, stored.span) as file:
             return file.read()
-    except FileNotFoundError as error:
-        raise UserError("the depth does not exist", stored.path, "copy the file again") from error
+    except OSError as error:
+        what = f"the depth cannot be read ({error.strerror or error})"
+        raise UserError(what, stored.path, "copy the file again") from error
 
 
 def _read_packed_steps(stored: StoredDepth) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 import re
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from numpy.lib import format as npy
@@ -63,7 +64,7 @@ def read_npy_array(data: bytes, path: Path) -> NDArray[np.generic]:
             shape, in_columns, dtype = npy.read_array_header_2_0(file)
         else:
             raise ValueError("of another version")
-    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
+    except (ValueError, TypeError, SyntaxError, TokenError, RecursionError) as error:
         raise UserError("the file is no NPY array", path, _AGAIN) from error
     if dtype.kind not in "fiub" or dtype.hasobject or dtype.names is not None:
         raise UserError(f"the NPY file holds {dtype}, not numbers", path, _AGAIN)

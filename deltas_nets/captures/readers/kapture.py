@@ -205,7 +205,8 @@ def _cam_from_world(
     for rig, sensor_from_rig in rigs.get(device, ()) if deepest else ():
         rig_from_world = _cam_from_world(stamp, rig, poses, rigs, deepest - 1)
         if rig_from_world is not None:
-            return sensor_from_rig.matrix @ rig_from_world
+            with np.errstate(invalid="ignore", over="ignore"):
+                return sensor_from_rig.matrix @ rig_from_world
     return None
 
 

@@ -106,4 +106,4 @@ def _pose(fields: Fields, id: str, path: Path) -> FloatArray | Lost:
     for row in range(3):
         for column in range(4):
             world_from_cam[row, column] = fields.numbers(f"t_{row}{column}", (), finite=False)
-    return cam_from_world_of(world_from_cam @ OPENGL, id=id, path=path)
+    return cam_from_world_of(world_from_cam * OPENGL, id=id, path=path)

@@ -20,8 +20,9 @@ __all__ = [
     "rotation_of_vector",
 ]
 
-OPENGL = np.diag([1.0, -1, -1, 1])
-"""A camera whose y points up and which looks along -z, from one of ours, and back."""
+OPENGL = np.array([1.0, -1, -1, 1])
+"""What the columns of a camera-to-world matrix are multiplied by where the camera's y points up and
+it looks along -z."""
 
 RIGID_TOLERANCE = 2e-3
 """Largest entry of R^T R - I, as in ScanNet's reader."""

@@ -103,4 +103,4 @@ def _intrinsics(fields: Fields, num_frames: int) -> FloatArray:
 
 def _pose(numbers: FloatArray, id: str, path: Path) -> FloatArray | Lost:
     rotation = rotations_of(numbers[[3, 0, 1, 2]])
-    return cam_from_world_of(rigid(rotation, numbers[4:]) @ OPENGL, id=id, path=path)
+    return cam_from_world_of(rigid(rotation, numbers[4:]) * OPENGL, id=id, path=path)

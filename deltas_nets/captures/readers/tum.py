@@ -1,7 +1,9 @@
 """TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, each line with a time stamp of its own."""
 
 import os
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from io import StringIO
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -149,10 +151,11 @@ def _head(path: Path) -> str:
 def _read_list(path: Path) -> _Listed:
     stamps, names, missing = [], [], 0
     known: dict[str, frozenset[str]] = {}
-    for number, words in _lines(path, "list of images"):
+    text = read_text(path, name="list of images", remedy=_LIST_REMEDY)
+    for number, words in _lines(text):
         if len(words) < 2:
             raise UserError(f"line {number} has no name of a file", path, _LIST_REMEDY)
-        stamp = _number(words[0], number, path, _LIST_REMEDY)
+        stamp = _number(words[0], number, path)
         # A name may hold spaces; four words are two lists joined by associate.py.
         name = words[1] if len(words) == 4 else " ".join(words[1:])
         if _is_there(path.parent, name, known):
@@ -178,45 +181,52 @@ def _is_there(folder: Path, name: str, known: dict[str, frozenset[str]]) -> bool
 
 
 def _read_trajectory(path: Path) -> _Trajectory:
-    rows = []
-    for number, words in _lines(path, "list of poses"):
-        if len(words) != 8:
-            what = f"line {number} has {len(words)} numbers, not 8"
-            raise UserError(what, path, _POSE_REMEDY)
-        stamp = _number(words[0], number, path, _POSE_REMEDY)
-        rows.append((stamp, *_numbers(words[1:], number, path)))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    if not len(table):
+    text = read_text(path, name="list of poses", remedy=_POSE_REMEDY)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            table = np.loadtxt(StringIO(text.replace(",", " ")), comments="#", ndmin=2)
+    except ValueError:
+        table = np.zeros((1, 0))
+    if not table.size and table.shape[0] != 1:
         raise UserError("the list of poses is empty", path, _POSE_REMEDY)
+    if table.shape[1] != 8 or not np.isfinite(table[:, 0]).all():
+        raise _wrong_line(text, path)
     table = table[np.argsort(table[:, 0], kind="stable")]
     return _Trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])
 
 
-def _lines(path: Path, name: str) -> list[tuple[int, list[str]]]:
-    text = read_text(path, name=name, remedy=_LIST_REMEDY)
-    split = (
-        (number, line.partition("#")[0].replace(",", " ").split())
-        for number, line in enumerate(text.splitlines(), start=1)
-    )
-    return [(number, words) for number, words in split if words]
+def _wrong_line(text: str, path: Path) -> UserError:
+    """The first line that is no pose."""
+    for number, words in _lines(text):
+        if len(words) != 8:
+            what = f"line {number} has {len(words)} numbers, not 8"
+            return UserError(what, path, _POSE_REMEDY)
+        try:
+            numbers = [float(word) for word in words]
+            finite = np.isfinite(numbers[0])
+        except ValueError:
+            finite = False
+        if not finite:
+            what = f"line {number} holds {' '.join(words)[:40]!r} where numbers should be"
+            return UserError(what, path, _POSE_REMEDY)
+    return UserError("the list of poses is malformed", path, _POSE_REMEDY)
 
 
-def _number(word: str, line: int, path: Path, remedy: str) -> float:
+def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if words:
+            yield number, words
+
+
+def _number(word: str, line: int, path: Path) -> float:
     try:
         value = float(word)
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise UserError(f"line {line} begins with {word[:20]!r}, no time stamp", path, remedy)
+        raise UserError(f"line {line} begins with {word[:20]!r}, no time stamp", path, _LIST_REMEDY)
     return value
-
-
-def _numbers(words: Sequence[str], line: int, path: Path) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError as error:
-        what = f"line {line} holds {' '.join(words)[:40]!r} where numbers should be"
-        raise UserError(what, path, _POSE_REMEDY) from error
 
 
 def _poses_at(stamps: FloatArray, known: _Trajectory) -> FloatArray:
