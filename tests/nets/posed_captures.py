@@ -34,10 +34,13 @@ IDS = st.lists(
 )
 
 
+_FOLDER = tempfile.TemporaryDirectory(prefix="deltas-test-")  # gone when the tests end
+
+
 @cache
 def image_of(size: tuple[int, int]) -> Path:
     """An image of (height, width), the same file each time."""
-    path = Path(tempfile.mkdtemp(prefix="deltas-test-")) / "image.png"
+    path = Path(_FOLDER.name) / f"{size[1]}x{size[0]}.png"
     Image.new("RGB", (size[1], size[0]), (7, 8, 9)).save(path)
     return path
 

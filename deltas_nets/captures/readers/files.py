@@ -63,13 +63,14 @@ class FileFinder:
         relative = name.replace("\\", "/")
         if relative.startswith("/") or relative[1:2] == ":":
             return None
+        up = ".." in Path(relative).parts
         around = os.path.abspath(self.folder.parent) + os.sep
-        for root in self.roots:
+        for root in [self.folder] if up else self.roots:
             path = root / relative
             suffixes = ("",) if path.suffix.lower() in self.suffixes else self.suffixes
             for suffix in suffixes:
                 file = path.with_name(path.name + suffix)
-                inside = os.path.abspath(file).startswith(around) or ".." not in path.parts
+                inside = not up or os.path.abspath(file).startswith(around)
                 if inside and _is_file(file):
                     return file
         return None
