@@ -36,7 +36,6 @@ class Cameras(NamedTuple):
 
 def cameras_of(proj: Tensor) -> Cameras:
     """Tell finite cameras ``(*B, V, 3, 4)`` from others."""
-    check_shapes(proj=(proj, "+V 3 4"))
     work = solver_dtype(proj)
     clean = proj.to(work)
     limit = torch.finfo(work).max ** 0.25

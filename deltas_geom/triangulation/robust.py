@@ -9,15 +9,21 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_positive
-from deltas_geom.numerics.arithmetic import surely_all, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    both,
+    only,
+    surely_all,
+    unless_all,
+    without_autocast,
+)
 from deltas_geom.numerics.sums import product
 from deltas_geom.status import Status
 from deltas_geom.triangulation.judge import ok
-from deltas_geom.triangulation.observed import check_observed
+from deltas_geom.triangulation.observed import check_observed, clean_pixels
 from deltas_geom.triangulation.pairs import pairs_of, points_of_pairs
 from deltas_geom.triangulation.results import RobustTriangulation
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
-from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT, check_weights
+from deltas_geom.triangulation.weights import weigh
 
 _BUDGET = 2**17  # distances at a time: what lies between stays in the cache
 _ROUNDS = 3  # of improving the inliers by their own point; the first settles nearly all
@@ -84,7 +90,7 @@ def triangulate_robust(
         >>> result.inliers[:, 0].tolist(), result.points.round(decimals=3)
         ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
-    check_observed(proj, pixels, weights, mask)
+    batch = check_observed(proj, pixels, weights, mask)
     check_positive(threshold=threshold)
     if min_inliers < 2:
         raise ValueError(f"min_inliers must be 2 or more, got {min_inliers}")
@@ -93,7 +99,7 @@ def triangulate_robust(
 
     with torch.no_grad():
         known = KnownCameras(proj)
-        observed = _observe(known, pixels, weights, mask)
+        observed = _observe(known, pixels, weights, mask, batch)
         chunk = max(1, min(8192, _BUDGET // max(1, observed.usable.shape[:-1].numel())))
         parts = [
             _consensus(known, observed.some(start, chunk), threshold, min_inliers, max_pairs)
@@ -112,7 +118,8 @@ class _Observations(NamedTuple):
     Attributes:
         proj: ``(*B, V, 3, 4)`` finite.
         pixels: ``(*B, V, N, 2)`` finite.
-        weights: ``(*B, V, N)`` largest 1; 0 where not usable.
+        weights: ``(*B, V, N)`` as given, or None.
+        squared: ``(*B, V, N)`` their squares, the largest of usable ones 1; 0 where not usable.
         usable: ``(*B, V, N)`` used, finite, of a weight that counts.
         finite: ``(*B, N)`` everything used is finite.
         centers: ``(*B, V, 3)`` of the cameras.
@@ -121,7 +128,8 @@ class _Observations(NamedTuple):
 
     proj: Tensor
     pixels: Tensor
-    weights: Tensor
+    weights: Tensor | None
+    squared: Tensor
     usable: Tensor
     finite: Tensor
     centers: Tensor
@@ -132,7 +140,8 @@ class _Observations(NamedTuple):
         points = slice(start, start + count)
         return self._replace(
             pixels=self.pixels[..., points, :],
-            weights=self.weights[..., points],
+            weights=None if self.weights is None else self.weights[..., points],
+            squared=self.squared[..., points],
             usable=self.usable[..., points],
             finite=self.finite[..., points],
             directions=self.directions[..., points],
@@ -140,34 +149,33 @@ class _Observations(NamedTuple):
 
 
 def _observe(
-    known: KnownCameras, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
+    known: KnownCameras,
+    pixels: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    batch: torch.Size,
 ) -> _Observations:
     cameras, inverse = known.inverses()
-    work = cameras.proj.dtype
-    weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    if mask is not None:
-        weight = torch.where(mask, weight, 0.0)
-    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", cameras.proj.shape[:-3])
-    weight = weight.to(work).abs().expand(*batch, *weight.shape[-2:])
-    pixels = pixels.to(work).expand(*weight.shape, 2)
-    healthy = (cameras.broken == 0).unsqueeze(-1)
-    # What is beyond counts as not finite: products of four overflow. NaN is beyond.
-    limit = torch.finfo(work).max ** 0.25
-    sound = (pixels.abs() < limit).all(dim=-1) & weight.isfinite() & healthy
-    used = weight != 0  # NaN counts as used
-    usable = used & sound
-    largest = torch.where(usable, weight, 0.0).amax(dim=-2, keepdim=True)
-    usable = usable & (weight > NEGLIGIBLE_WEIGHT * largest)  # as in triangulation
-    if not surely_all(usable):
-        pixels = torch.where(usable[..., None], pixels, 0.0)
-        weight = torch.where(usable, weight, 0.0)
-    rays = product(inverse[..., :2], pixels.mT) + inverse[..., 2:]  # (*B, V, 3, N)
+    x, y, sound = clean_pixels(pixels)
+    healthy = unless_all(cameras.broken == 0)
+    sound = both(sound, None if healthy is None else healthy.unsqueeze(-1))
+    weighed = weigh(weights, mask, batch=batch, like=pixels, sound=sound)
+    finite = weighed.sound
+    if not surely_all(finite):
+        # What is not finite is an outlier: it has no say in how much the others count.
+        good = both(sound, None if weights is None else weights.isfinite())
+        weighed = weigh(weights, both(mask, good), batch=batch, like=pixels, sound=None)
+    usable, shape = ~weighed.unused, (*batch, *pixels.shape[-3:-1])
+    counted = unless_all(usable)
+    x, y = only(x, counted), only(y, counted)
+    rays = product(inverse[..., :2], torch.stack([x, y], dim=-2)) + inverse[..., 2:]
     return _Observations(
         proj=cameras.proj.expand(*batch, *cameras.proj.shape[-3:]),
-        pixels=pixels,
-        weights=weight / torch.where(largest > 0, largest, 1.0),
-        usable=usable,
-        finite=(sound | ~used).all(dim=-2),
+        pixels=torch.stack([x, y], dim=-1).expand(*shape, 2),
+        weights=weights,
+        squared=weighed.squared.expand(shape),
+        usable=usable.expand(shape),
+        finite=finite.expand(*batch, shape[-1]),
         centers=cameras.centers.expand(*batch, *cameras.centers.shape[-2:]),
         directions=rays.transpose(-3, -2).expand(*batch, -1, -1, -1),
     )
@@ -262,7 +270,7 @@ def _judge(
     distance, representable = _distances(observed, points)
     distance = distance.clamp(max=threshold**2)
     agree = observed.usable.unsqueeze(-2) & (distance < threshold**2)
-    cost = (observed.weights.square().unsqueeze(-2) * distance).sum(dim=-3)
+    cost = (observed.squared.unsqueeze(-2) * distance).sum(dim=-3)
     possible = exist & representable & (agree.sum(dim=-3) >= min_inliers)
     cheapest, index = torch.where(possible, cost, torch.inf).min(dim=-2, keepdim=True)
     inliers = torch.take_along_dim(agree, index.unsqueeze(-3), dim=-2).squeeze(-2)

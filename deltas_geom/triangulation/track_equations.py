@@ -5,9 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import solver_dtype
 from deltas_geom.numerics.ldl import Symmetric4, Vector4
-from deltas_geom.triangulation.observed import Vector3, projection_centers
+from deltas_geom.triangulation.observed import Vector3, cameras_of, clean_pixels
 from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame
 from deltas_geom.triangulation.solution import in_world
 from deltas_geom.triangulation.weights import Weights, weigh_listed
@@ -88,18 +87,15 @@ def pose_tracks(
         weights: ``(T)``.
         num_points: N.
     """
-    work = solver_dtype(proj)
-    finite = (proj.detach().to(work).abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)
-    camera = torch.where(finite[:, None, None], proj, 0.0).to(work)
+    camera, broken, centers = cameras_of(proj)
     listed = _listed(camera, pixels, camera_index, point_index, num_points, weights)
 
-    centers = projection_centers(camera)
     # Of all cameras alike: those that see nothing do no harm beyond rounding.
     datum = centers.detach().mean(dim=0, keepdim=True)
     sums = (
         summed(at(moments, camera_index) * times, point_index, num_points).unbind()
         for moments, times in zip(
-            camera_moments(centers, datum, (~finite).to(work)),
+            camera_moments(centers, datum, broken),
             (listed.weights.squared, listed.weights.used),
             strict=True,
         )
@@ -127,15 +123,12 @@ def _listed(
     num_points: int,
     weights: Tensor,
 ) -> Listed:
-    x, y = pixels.to(camera.dtype).unbind(dim=-1)
-    with torch.no_grad():
-        # What is beyond overflows; NaN is not below.
-        sound = x * x + y * y < torch.finfo(x.dtype).max ** 0.25
-    # Double where: what is not used must pass no gradient and no NaN.
+    x, y, sound = clean_pixels(pixels)
+    sound = torch.ones_like(x, dtype=torch.bool) if sound is None else sound
     return Listed(
         camera=at(camera.permute(1, 2, 0), camera_index),
-        x=torch.where(sound, x, 0.0),
-        y=torch.where(sound, y, 0.0),
+        x=x,
+        y=y,
         weights=weigh_listed(weights.to(x.dtype), point_index, num_points, sound=sound),
         point=point_index,
     )

@@ -12,14 +12,14 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
 from deltas_geom.epipolar.fundamental import cross_matrix
-from deltas_geom.numerics.arithmetic import solver_dtype, without_autocast
+from deltas_geom.numerics.arithmetic import only, without_autocast
 from deltas_geom.numerics.sums import product
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 from deltas_geom.triangulation.bearings import dot
 from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
-from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.triangulation.observed import Vector3, clean_pixels
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import reproject
 from deltas_geom.triangulation.results import beyond, refused_by_residual, without
@@ -185,16 +185,13 @@ class _Seen(NamedTuple):
 
 
 def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
-    work = solver_dtype(pixels)
-    camera, xy = proj.to(work), pixels.mT.to(work).contiguous()
-    used = xy.new_ones((2, 1), dtype=torch.bool) if mask is None else mask
+    x, y, sound = clean_pixels(pixels)
+    camera, used = proj.to(x.dtype), torch.ones_like(x, dtype=torch.bool) if mask is None else mask
     # Products of four of what is let through can be represented. NaN is not let through.
-    limit = torch.finfo(work).max ** 0.25
-    known = (camera.abs() < limit).all(-1).all(-1)
-    finite = (xy.abs() < limit).all(dim=-2) & known[..., None]
-    used = torch.zeros_like(finite) | used
+    known = (camera.abs() < torch.finfo(x.dtype).max ** 0.25).all(-1).all(-1)
+    finite = only(known.unsqueeze(-1), sound, other=False)
     camera = torch.where(known[..., None, None], camera, 0.0)
-    xy = torch.where((finite & used).unsqueeze(-2), xy, 0.0)
+    xy = torch.where((finite & used).unsqueeze(-2), torch.stack([x, y], dim=-2), 0.0)
     known, enough = (finite | ~used).all(dim=-2), used.all(dim=-2)
     dtype = torch.promote_types(proj.dtype, pixels.dtype)
     return _Seen(_rig(camera), xy, known, enough, camera, dtype)

@@ -334,6 +334,17 @@ def test_status_tells_the_truth_and_what_fails_has_no_gradient(
             assert (pulled[leaf][:, 1:] == 0).all() and (pulled[leaf][:, 0] != 0).any(), leaf
 
 
+@pytest.mark.parametrize("name", [n for n in SOLVERS if SOLVERS[n].takes("pixels")])
+@pytest.mark.parametrize("size", [1e38, 1e39])  # squares of squares of 1e38 are numbers
+def test_pixels_whose_products_overflow_are_not_finite(name: str, size: float) -> None:
+    inputs = inputs_of(forward_motion())
+    inputs["pixels"][1, 0] = size
+    found = SOLVERS[name](inputs)
+    if "status" in found:
+        assert (found["status"][0] == Status.NOT_FINITE_INPUT) == (size > 1e38)
+    assert size < 1e39 or "valid" not in found or not found["valid"][0]
+
+
 @OF_SOLVED
 def test_one_view_is_too_few(name: str) -> None:
     solver = SOLVERS[name]
