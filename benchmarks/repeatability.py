@@ -140,7 +140,7 @@ def main() -> None:
     torch.set_num_threads(1)
     capture = open_capture(options.capture)
     file = options.view_sets or options.capture / "view_sets.json"
-    view_sets = usable_view_sets(capture, file if file.is_file() else None, None)
+    view_sets = usable_view_sets(capture, file if file.is_file() else None, None).view_sets
     named = detectors(options)
     points: dict[tuple[str, int], Tensor] = {}
     pairs: dict[str, list[Repeatability]] = {name: [] for name in named}

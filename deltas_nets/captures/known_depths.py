@@ -5,7 +5,13 @@ import numpy as np
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 
-__all__ = ["depths_of_sensor", "known_depths", "points_in_view", "typical_depths"]
+__all__ = [
+    "depths_of_sensor",
+    "farthest_depth",
+    "known_depths",
+    "points_in_view",
+    "typical_depths",
+]
 
 ENOUGH = 20
 """Points that tell what a frame shows; fewer may all be on one thing."""
@@ -75,3 +81,14 @@ def typical_depths(capture: Capture) -> FloatArray:
             if points is not None:
                 found[position] = np.median(points[:, 2])
     return found
+
+
+def farthest_depth(capture: Capture) -> float:
+    """The largest depth that a frame's sparse points or stated range reach, but for a few; or 0."""
+    far = 0.0 if capture.depth_ranges is None else float(capture.depth_ranges[:, 1].max())
+    if capture.points is not None:
+        for position in range(len(capture.frames)):
+            points = points_in_view(capture, position)
+            if points is not None:
+                far = max(far, float(np.percentile(points[:, 2], 98)))
+    return far

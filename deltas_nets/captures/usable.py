@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.captures.view_choice import ChosenViews, choose_views
 from deltas_nets.captures.view_sets import (
     ViewSet,
     check_frames,
@@ -16,23 +17,61 @@ from deltas_nets.captures.view_sets import (
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
+FEW = 5
+"""Views of a set where nobody asks for more or less."""
+
+
+class UsableViews(NamedTuple):
+    """View sets, and how many have fewer views than asked."""
+
+    view_sets: tuple[ViewSet, ...]
+    short: int
+
 
 def usable_view_sets(
-    capture: Capture, file: Path | None, num_views: int | None
-) -> tuple[ViewSet, ...]:
-    """The file's view sets, shortened to so many views, or ones that we choose."""
+    capture: Capture,
+    file: Path | None,
+    num_views: int | None,
+    *,
+    working_depth: float | None = None,
+    anchors: Sequence[str] | None = None,
+) -> UsableViews:
+    """The file's view sets, shortened to so many views, the capture's own, or ones that we choose.
+
+    Args:
+        capture: the frames.
+        file: of view sets, or None.
+        num_views: at most so many; as many as there are, or 5 of chosen ones, if not given.
+        working_depth: as for `deltas_nets.captures.view_choice.choose_view_sets`.
+        anchors: frames that want a set, where no file says it; all if not given.
+    """
     if num_views is not None and num_views < 2:
         raise UserError("too few views", f"--views {num_views}", "use 2 or more")
-    if file is None:
-        view_sets = choose_view_sets(capture, num_views or 5)
-    else:
+    wanted = num_views or FEW
+    if file is not None:
         view_sets = read_view_sets(file, capture)
-    if num_views is None:
-        return view_sets
-    most = 1 + max(len(views.sources) for views in view_sets)
-    if most < num_views:
-        warn(f"no map is from {num_views} views: there are at most {most} that go together")
-    return tuple(views._replace(sources=views.sources[: num_views - 1]) for views in view_sets)
+        wanted = num_views or 2
+    elif capture.sources is not None:
+        chosen = capture.frames if anchors is None else anchors
+        known = {
+            id: [s for s in capture.sources.get(id, ()) if s in capture.frames] for id in chosen
+        }
+        view_sets = tuple(ViewSet(id, tuple(sources)) for id, sources in known.items() if sources)
+    else:
+        found = choose_views(capture, wanted, working_depth=working_depth, anchors=anchors)
+        view_sets = found.view_sets
+        _tell_of_short(found, wanted)
+    if file is None or num_views is not None:
+        view_sets = tuple(v._replace(sources=v.sources[: wanted - 1]) for v in view_sets)
+    return UsableViews(view_sets, sum(len(views.sources) < wanted - 1 for views in view_sets))
+
+
+def _tell_of_short(found: ChosenViews, wanted: int) -> None:
+    """Warn of sets with fewer views than asked, and say why."""
+    count = sum(found.short.values())
+    if count:
+        why = "; ".join(f"other frames {reason} ({n})" for reason, n in found.short.items())
+        warn(f"{count} of {len(found.view_sets)} view sets have fewer than {wanted} views: {why}")
 
 
 def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[ViewSet, ...]:
@@ -62,8 +101,10 @@ def warn_of(
     depth_range: tuple[float, float],
 ) -> None:
     """Warnings of what may be a mistake, and one that names the frames without a pose."""
-    for doubt in (*capture.doubts, doubtful_scale(capture, view_sets, depth_range)):
-        if doubt is not None:
-            warn(doubt)
+    for doubt in capture.doubts:
+        warn(doubt)
+    scale = doubtful_scale(capture, view_sets, depth_range) if capture.metric else None
+    if scale is not None:
+        warn(scale)
     if capture.lost and view_sets_file is None:
         warn(f"frames without a usable pose are left out: {ids_in_words(capture.lost)}")

@@ -3,15 +3,25 @@
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.commands.flags import Flag, Prediction, sensible
+from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.depth_formats import MILLIMETRES, DepthFormatName
 from deltas_nets.terminal import progress, warn
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+    from deltas_nets.captures.usable import UsableViews
+    from deltas_nets.outputs.folder import OutputFolder
+    from deltas_nets.outputs.products import OutputOptions
+    from deltas_nets.predict.capture import Outcome
+    from deltas_nets.predict.depth_map import PredictConfig
+    from deltas_nets.predict.predictor import Predictor
 
 
 def read_shard(text: str) -> tuple[int, int]:
@@ -27,30 +37,40 @@ def read_shard(text: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Depth(Prediction):
-    """Write a metric depth map for every frame of a posed capture.
+class Depth(Captured, Prediction):
+    """Write a depth map for every frame of a posed capture.
 
-    The capture is a folder in ScanNet's export layout: color/N.jpg, pose/N.txt,
-    intrinsic/intrinsic_color.txt. Writes DIR/depth/N.png (16-bit millimetres),
-    DIR/confidence/N.png, DIR/points/N.ply and DIR/summary.json. The network that the authors of the
-    paper published states no confidence, so with its checkpoint none is written.
+    The capture is a COLMAP model with its photos, a transforms.json, a phone's or a tracker's
+    export, or frames.json of your own: docs/captures.md lists them all. Writes DIR/depth/ID.png
+    (16-bit millimetres), DIR/confidence/ID.png, DIR/points/ID.ply and DIR/summary.json. Where the
+    capture has no metres, neither have these: they are in its own unit, as the summary says. The
+    network that the authors of the paper published states no confidence, so with its checkpoint
+    none is written.
 
-    Example: deltas depth my_capture --out depth --views 5
+    Example: deltas depth my_capture --views 5
     """
 
     capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
         kw_only=True
     )
-    """Folder with images, poses and intrinsics, or a folder with one such scene inside."""
-    out: Path = field(kw_only=True)
-    """Folder to write to; the same command continues a run that was stopped."""
+    """Folder with images, poses and intrinsics, or a file that names them."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder to write to, CAPTURE-depth here if not given; the same command continues a run that
+    was stopped."""
+    depth_range: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
+    """Nearest and farthest depth searched, in the capture's unit. If not given it follows from the
+    capture for each frame: sparse points, sensor depth, or a first look; 0.5 10 in rooms."""
     view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen by baseline and overlap if not
-    given."""
+    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen by angle and overlap if not given."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Views per depth map, the anchor included; all of the view sets', or 5, if not given."""
-    depth_scale: float = 1000.0
-    """Steps of depth/N.png in a metre: 1000 are millimetres, up to 65.5 m; 100 reach 655 m."""
+    keyframes: Flag = False
+    """Of a video: maps of those frames alone that see something new."""
+    format: DepthFormatName = "png"
+    """Of depth maps: png holds 16-bit steps, the others float32 in the capture's unit."""
+    depth_scale: Annotated[float | None, tyro.conf.arg(metavar="STEPS")] = None
+    """Steps of depth/ID.png in a unit: 1000 in a metre, which reaches 65.5 m, if not given; of a
+    capture without metres so many that they are fine enough. The summary states it."""
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
     """Size of the maps; the colour image's if not given."""
     min_confidence: float = 0.0
@@ -64,65 +84,154 @@ class Depth(Prediction):
 
     def run(self) -> None:
         """Run the command."""
-        import torch
-
-        from deltas_nets.captures.ids import id_in_json
-        from deltas_nets.captures.opening import open_capture
+        from deltas_nets.captures.keyframes import keyframes
         from deltas_nets.captures.usable import check_all, usable_view_sets, warn_of
-        from deltas_nets.outputs.folder import prepare_output
-        from deltas_nets.outputs.products import MILLIMETRES, OutputOptions, check_depth_fits
-        from deltas_nets.outputs.summary import SCALE, SUMMARY, read_summary, view_sets_in_json
+        from deltas_nets.captures.working_depth import knows_its_scale
+        from deltas_nets.outputs.products import check_depth_fits
         from deltas_nets.predict.capture import predict_capture
+        from deltas_nets.predict.first_look import depth_seen
+        from deltas_nets.predict.search import Asked, Followed
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
-        options = sensible(OutputOptions, depth_scale=self.depth_scale)
-        check_depth_fits(self.depth_range, options)
-        capture = open_capture(self.capture).remembering()
-        view_sets = usable_view_sets(capture, self.view_sets, self.views)
-        check_all(capture, view_sets)
-        warn_of(capture, view_sets, self.view_sets, self.depth_range)
+        options = self._options()
+        if self.depth_range is not None:
+            check_depth_fits(self.depth_range, options)
+        capture = self.opened(self.capture).remembering()
         predictor = self.predictor()
-        predictor.check_asked(config, capture, view_sets)
-        mine = view_sets[shard[0] - 1 :: shard[1]]
-        scale = {} if self.depth_scale == MILLIMETRES else {SCALE: self.depth_scale}
-        folder = prepare_output(
-            self.out,
+        capture = self.in_metres(capture, predictor, config)
+        guesses = not knows_its_scale(capture)
+        # Where nothing tells how far surfaces are a few maps do, before views are chosen.
+        depth = depth_seen(predictor, capture, config) if guesses else None
+        found = usable_view_sets(
+            capture,
+            self.view_sets,
+            self.views,
+            working_depth=depth,
+            anchors=keyframes(capture, working_depth=depth) if self.keyframes else None,
+        )
+        check_all(capture, found.view_sets)
+        warn_of(capture, found.view_sets, self.view_sets, self.range)
+        options = self._fitting(options, capture, depth)
+        options = replace(options, confidence=predictor.states_confidence)
+        predictor.check_asked(config, capture, found.view_sets)
+        mine = found.view_sets[shard[0] - 1 :: shard[1]]
+        folder = self._folder(capture, found, shard, options, predictor, config)
+        search = Followed(capture) if self.depth_range is None else Asked(capture, self.depth_range)
+        with progress("depth", len(mine)) as report:
+            outcome = predict_capture(
+                predictor, capture, mine, folder, config, search=search, report=report
+            )
+        self._tell(outcome, folder, options)
+
+    def _options(self) -> "OutputOptions":
+        from deltas_nets.outputs.products import OutputOptions
+
+        if self.depth_scale is not None and self.format != "png":
+            what = f"depth is written as float32 in {self.format}"
+            raise UserError(what, "--depth-scale", "leave it out")
+        scale = MILLIMETRES if self.depth_scale is None else self.depth_scale
+        return sensible(OutputOptions, depth_scale=scale, depth_format=self.format)
+
+    def _fitting(
+        self, options: "OutputOptions", capture: "Capture", depth: float | None
+    ) -> "OutputOptions":
+        """The options with the capture's unit, and steps that are fine and reach far enough."""
+        from deltas_nets.captures.known_depths import farthest_depth
+        from deltas_nets.captures.working_depth import working_depths
+        from deltas_nets.outputs.products import OWN_UNIT, check_depth_fits, steps_to
+
+        far = farthest_depth(capture)
+        if not capture.metric:
+            options = replace(options, unit=OWN_UNIT)
+            usual = float(working_depths(capture).max()) if depth is None else depth
+            if self.depth_scale is None:
+                return replace(options, depth_scale=steps_to(max(far, 4 * usual)))
+        if self.depth_range is None and far > 0:
+            check_depth_fits((0.0, far), options)
+        return options
+
+    def _folder(
+        self,
+        capture: "Capture",
+        views: "UsableViews",
+        shard: tuple[int, int],
+        options: "OutputOptions",
+        predictor: "Predictor",
+        config: "PredictConfig",
+    ) -> "OutputFolder":
+        import torch
+
+        from deltas_nets.captures.ids import id_in_json
+        from deltas_nets.outputs.folder import prepare_output
+        from deltas_nets.outputs.summary import FORMAT, SCALE, view_sets_in_json
+
+        predict = to_dict(config)
+        if self.depth_range is None:
+            predict["depth_range"] = "as the capture suggests, frame by frame"
+        unusual = {SCALE: (options.depth_scale, MILLIMETRES), FORMAT: (options.depth_format, "png")}
+        mine = views.view_sets[shard[0] - 1 :: shard[1]]
+        return prepare_output(
+            self.folder,
             settings={
-                "predict": to_dict(config),
+                "predict": predict,
                 "network": predictor.network_record(),
                 "weights": predictor.weights_record(self.weights),
                 "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
                 "precision": self.precision,
                 "views": self.views,
-                "view_sets": view_sets_in_json(view_sets),
-                **scale,
+                "view_sets": view_sets_in_json(views.view_sets),
+                **{name: value for name, (value, usual) in unusual.items() if value != usual},
             },
             overwrite=self.overwrite,
             forbidden=capture.path,
             shard=shard,
             frame_ids=[views.anchor for views in mine],
-            options=replace(options, confidence=predictor.states_confidence),
+            options=options,
             head={
                 "versions": {"deltas-depth": __version__, "torch": torch.__version__},
+                "layout": capture.layout,
+                "unit": options.unit,
                 "lost_poses": list(map(id_in_json, capture.lost)),
+                "sets_short_of_views": views.short,
             },
         )
-        with progress("depth", len(mine)) as report:
-            outcome = predict_capture(predictor, capture, mine, folder, config, report=report)
+
+    @property
+    def folder(self) -> Path:
+        """Where outputs go."""
+        return self.out or Path(f"{self.capture.resolve().stem}-depth")
+
+    def _tell(self, outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions") -> None:
+        """What became of it all, in a few lines."""
+        from deltas_nets.outputs.summary import SUMMARY, read_summary
+        from deltas_nets.outputs.verdict import verdict
+
         kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
-        print(f"{outcome.written} depth maps in {self.out}{kept}")
-        if not predictor.states_confidence:
+        unit = "" if options.unit == "metre" else f", in {options.unit}"
+        print(f"{outcome.written} depth maps in {self.folder}{unit}{kept}")
+        if not options.confidence:
             print("no confidence is written: the reference network states none")
         if outcome.blind:
             warn(f"{outcome.blind} maps without a triangulated point are guesses: see summary.json")
+        if outcome.piled:
+            warn(
+                f"points of {outcome.piled} maps pile up at an end of the depth that was searched: "
+                "is --depth-range too narrow, or a pose wrong? See summary.json"
+            )
         saturated = sum("saturated_pixels" in record for record in folder.frames.values())
         if saturated:
-            most = f"{options.max_depth:g} m"
+            most = f"{options.max_depth:g} {'m' if options.unit == 'metre' else 'units'}"
             warn(
                 f"{saturated} maps have depth beyond {most} that is written as {most}: add "
-                f"--depth-scale {self.depth_scale / 10:g}; see summary.json"
+                f"--depth-scale {options.depth_scale / 10:g} or --format npz; see summary.json"
             )
-        waiting = (read_summary(self.out / SUMMARY) or {}).get("waiting_for", ())
-        if waiting:
-            print(f"the folder is complete after --shard {', '.join(waiting)}")
+        summary = read_summary(self.folder / SUMMARY) or {}
+        if outcome.written:
+            said = verdict(
+                list(folder.frames.values()), short=summary.get("sets_short_of_views", 0)
+            )
+            (warn if said.doubtful else print)(said.line)
+            folder.write_summary(summary.get("status", "complete"), verdict=said.line)
+        if summary.get("waiting_for"):
+            print(f"the folder is complete after --shard {', '.join(summary['waiting_for'])}")

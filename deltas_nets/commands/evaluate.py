@@ -91,14 +91,12 @@ class Evaluate(Prediction):
         if self.predictions is not None and self.view_sets is None:
             view_sets = recorded_view_sets(self.predictions)
         else:
-            view_sets = usable_view_sets(capture, self.view_sets, self.views)
-        warn_of(capture, view_sets, self.view_sets or self.predictions, self.depth_range)
+            view_sets = usable_view_sets(capture, self.view_sets, self.views).view_sets
+        warn_of(capture, view_sets, self.view_sets or self.predictions, self.range)
         view_sets = with_depth_only(capture, view_sets)
         check_all(capture, view_sets, with_depth=True)
         if self.predictions is not None:
-            return evaluate_files(
-                self.predictions, capture, view_sets, depth_range=self.depth_range
-            )
+            return evaluate_files(self.predictions, capture, view_sets, depth_range=self.range)
         predictor = self.predictor()
         predictor.check_asked(config, capture, view_sets)
         with progress("evaluate", len(view_sets)) as report:
@@ -125,4 +123,4 @@ class Evaluate(Prediction):
             conditions=self.conditions,
         )
         with progress("evaluate", count) as report:
-            return score_rooms(model, rooms, depth_range=self.depth_range, report=report)
+            return score_rooms(model, rooms, depth_range=self.range, report=report)

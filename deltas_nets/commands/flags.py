@@ -1,7 +1,9 @@
 """Flags that several commands share."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
@@ -10,6 +12,7 @@ from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
 if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
     from deltas_nets.predict.depth_map import PredictConfig
     from deltas_nets.predict.predictor import Predictor
 
@@ -33,8 +36,8 @@ class Prediction(Command):
     precision: Literal["float32", "bfloat16"] = "float32"
     """bfloat16 is as accurate, and faster where the processor multiplies it (AMX, NVIDIA); others
     emulate it. Geometry stays in float32."""
-    depth_range: tuple[float, float] = (0.5, 10.0)
-    """Nearest and farthest depth searched, metres."""
+    depth_range: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
+    """Nearest and farthest depth searched, metres; 0.5 10 if not given."""
     work_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
     """What the network sees; chosen to suit it if not given."""
     debug: Flag = False
@@ -51,8 +54,56 @@ class Prediction(Command):
         """The flags as a config, with nonsense refused."""
         from deltas_nets.predict.depth_map import PredictConfig
 
-        fields = {"depth_range": self.depth_range, "work_size": self.work_size, **more}
+        fields = {"depth_range": self.range, "work_size": self.work_size, **more}
         return sensible(PredictConfig, **fields)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Of the search, where nothing but the flag says it."""
+        return self.depth_range or (0.5, 10.0)
+
+
+@dataclass(frozen=True)
+class Captured:
+    """A command that reads a capture: flags that say of it what its files do not."""
+
+    intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
+    """Of all images, whatever the capture says: "fx fy cx cy", then k1 k2 p1 p2 k3 of a lens as
+    OpenCV orders them, or freiburg1, 2, 3 of TUM RGB-D."""
+    scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
+    """Metres in a unit of the capture; 1 says that it is in metres."""
+    scale_from: Annotated[Path | None, tyro.conf.arg(metavar="sensor|FILE")] = None
+    """Make it metric by its sensor depth, or by a file of measured depths: lines ID X Y METRES."""
+
+    def opened(self, path: Path) -> "Capture":
+        """The capture, in metres if --scale says how."""
+        from deltas_nets.captures.camera_words import Intrinsics
+        from deltas_nets.captures.opening import open_capture
+        from deltas_nets.captures.scaled import scaled
+
+        if self.scale is not None and not 0 < self.scale < math.inf:
+            raise UserError("no scale", f"--scale {self.scale:g}", "give a positive number")
+        if self.scale is not None and self.scale_from is not None:
+            raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
+        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
+        capture = open_capture(path, intrinsics=stated)
+        return capture if self.scale is None else scaled(capture, self.scale)
+
+    def in_metres(
+        self, capture: "Capture", predictor: "Predictor", config: "PredictConfig"
+    ) -> "Capture":
+        """The capture in metres if --scale-from says how, else as it is."""
+        from deltas_nets.captures.scaled import scaled
+        from deltas_nets.predict.first_look import scale_by_measurements, scale_by_sensor
+
+        if self.scale_from is None:
+            return capture
+        if str(self.scale_from) == "sensor":
+            scale = scale_by_sensor(predictor, capture, config)
+        else:
+            scale = scale_by_measurements(predictor, capture, config, self.scale_from)
+        print(f"a unit of the capture is {scale:.4g} m")
+        return scaled(capture, scale)
 
 
 def sensible(config: Callable[..., T], **fields: Any) -> T:

@@ -14,10 +14,12 @@ from deltas_nets.evaluate.points import score_keypoints
 from deltas_nets.evaluate.scores import CaptureScores as CaptureScores
 from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
 from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
-from deltas_nets.outputs.products import read_depth_png
+from deltas_nets.outputs.depth_formats import read_depth_map
 from deltas_nets.outputs.summary import recorded_depth_scale
-from deltas_nets.predict.depth_map import PredictConfig, resized
+from deltas_nets.predict.depth_map import PredictConfig, frames_of, resized
+from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
+from deltas_nets.predict.reach import Reach
 
 
 def evaluate_network(
@@ -45,8 +47,7 @@ def evaluate_network(
     for views in view_sets:
         anchor = capture.frame(views.anchor)
         truth = depth_at_image(anchor)
-        frames = [anchor, *(capture.frame(id) for id in views.sources)]
-        found = predictor.depth_map(frames, config)
+        found = look(predictor, frames_of(capture, views), config, Reach(*config.depth_range))
         sparse = score_keypoints(found.keypoints, truth, config.depth_range)
         scores[str(views.anchor)] = score_map(found.depth, truth, config.depth_range, sparse)
         if found.log_std is not None:
@@ -79,13 +80,7 @@ def evaluate_files(
     scores: dict[str, MapScores | None] = {}
     scale = recorded_depth_scale(predictions)
     for views in view_sets:
-        file = predictions / "depth" / f"{views.anchor}.png"
-        try:
-            predicted = read_depth_png(file, scale=scale)
-        except OSError as error:
-            raise UserError(
-                f"no depth map ({error.strerror or error})", file, "run deltas depth first"
-            ) from error
+        predicted = read_depth_map(predictions, views.anchor, scale)
         truth = depth_at_image(capture.frame(views.anchor))
         scores[str(views.anchor)] = score_map(predicted, truth, depth_range, None)
     return _mean(scores, capture.path, CalibrationMeter())

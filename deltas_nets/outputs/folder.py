@@ -231,7 +231,7 @@ def _remove_shard_summaries(out: Path) -> None:
 
 def _remove_temporary(out: Path) -> None:
     """Remove what a killed run left half written; not beside other shards, which live."""
-    for folder in (out, *(out / product.name for product in PRODUCTS)):
-        for path in folder.iterdir() if folder.is_dir() else ():
-            if TEMPORARY.match(path.name):
-                path.unlink()
+    files = [*out.glob("*"), *(file for row in PRODUCTS for file in (out / row.name).rglob("*"))]
+    for path in files:
+        if TEMPORARY.match(path.name):
+            path.unlink(missing_ok=True)

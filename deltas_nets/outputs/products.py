@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +15,17 @@ from PIL import Image
 from deltas_nets.captures.frame import Frame
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_atomically
+from deltas_nets.outputs.depth_formats import (
+    DEPTH_FORMATS,
+    MAX_STEPS,
+    MILLIMETRES,
+    DepthFormatName,
+    read_depth_png,
+    write_depth_png,
+)
 
 __all__ = [
+    "OWN_UNIT",
     "PRODUCTS",
     "FrameOutput",
     "OutputOptions",
@@ -25,17 +35,19 @@ __all__ = [
     "read_depth_png",
     "read_points_ply",
     "remarks_on",
+    "steps_to",
     "write_confidence_png",
     "write_depth_png",
     "write_points_ply",
 ]
 
-MILLIMETRES = 1000.0  # steps in a metre
-MAX_STEPS = 65534  # 65535 means "none" to some readers
-
 FINE_ENOUGH = 1000.0
 """Metres from the origin up to which points are written in float32, whose steps are 0.06 mm there.
 Beyond, as of surveyed (UTM) coordinates, they are written in float64."""
+
+
+OWN_UNIT = "the capture's own unit"
+"""Where the capture has no metres."""
 
 
 class FrameOutput(NamedTuple):
@@ -43,9 +55,9 @@ class FrameOutput(NamedTuple):
 
     Attributes:
         anchor: the frame.
-        depth: ``(H, W)`` metres, 0 where there is none.
+        depth: ``(H, W)`` in the capture's unit, 0 where there is none.
         confidence: ``(H, W)`` in [0, 1]; None where the network states none.
-        points: ``(N, 3)`` in the capture's world, metres.
+        points: ``(N, 3)`` in the capture's world and unit.
         colors: ``(N, 3)`` uint8.
     """
 
@@ -63,7 +75,11 @@ class OutputOptions:
     confidence: bool = True
     """Whether the network states one."""
     depth_scale: float = MILLIMETRES
-    """Steps of the depth image in a metre."""
+    """Steps of the depth image in a unit."""
+    depth_format: DepthFormatName = "png"
+    """Suffix of the files of depth: whole steps in a png, float32 in the others."""
+    unit: str = "metre"
+    """Of depth and points."""
 
     def __post_init__(self) -> None:
         if not (self.depth_scale > 0 and math.isfinite(self.depth_scale)):
@@ -71,8 +87,8 @@ class OutputOptions:
 
     @property
     def max_depth(self) -> float:
-        """The largest depth that the files hold, metres."""
-        return MAX_STEPS / self.depth_scale
+        """The largest depth that the files hold, in the unit."""
+        return MAX_STEPS / self.depth_scale if self.depth_format == "png" else math.inf
 
 
 class Product(NamedTuple):
@@ -82,21 +98,27 @@ class Product(NamedTuple):
         name: of its folder.
         suffix: of the file.
         write: writes it.
-        needs_confidence: it is written only where the network states a confidence.
+        wanted: whether a folder with these options holds it.
     """
 
     name: str
     suffix: str
     write: Callable[[Path, FrameOutput, OutputOptions], None]
-    needs_confidence: bool = False
+    wanted: Callable[[OutputOptions], bool] = lambda _: True
 
     def file(self, folder: Path, id: str) -> Path:
         """Where it is written for a frame."""
         return folder / self.name / f"{id}{self.suffix}"
 
 
-def _write_depth(path: Path, frame: FrameOutput, options: OutputOptions) -> None:
-    write_depth_png(path, frame.depth, scale=options.depth_scale)
+def _write_depth(
+    format: DepthFormatName, path: Path, frame: FrameOutput, options: OutputOptions
+) -> None:
+    DEPTH_FORMATS[format].write(path, frame.depth, options.depth_scale, options.unit)
+
+
+def _has_depth(format: DepthFormatName, options: OutputOptions) -> bool:
+    return options.depth_format == format
 
 
 def _write_confidence(path: Path, frame: FrameOutput, options: OutputOptions) -> None:
@@ -109,15 +131,18 @@ def _write_points(path: Path, frame: FrameOutput, options: OutputOptions) -> Non
 
 
 PRODUCTS = (
-    Product("depth", ".png", _write_depth),
-    Product("confidence", ".png", _write_confidence, needs_confidence=True),
+    *(
+        Product("depth", f".{name}", partial(_write_depth, name), partial(_has_depth, name))
+        for name in DEPTH_FORMATS
+    ),
+    Product("confidence", ".png", _write_confidence, lambda options: options.confidence),
     Product("points", ".ply", _write_points),
 )
 
 
 def products_of(options: OutputOptions) -> tuple[Product, ...]:
     """What a folder with these options holds."""
-    return tuple(row for row in PRODUCTS if options.confidence or not row.needs_confidence)
+    return tuple(row for row in PRODUCTS if row.wanted(options))
 
 
 def remarks_on(frame: FrameOutput, options: OutputOptions) -> dict[str, Any]:
@@ -125,6 +150,16 @@ def remarks_on(frame: FrameOutput, options: OutputOptions) -> dict[str, Any]:
     far = np.asarray(frame.depth, dtype=np.float64) > options.max_depth
     count = int((far & np.isfinite(frame.depth)).sum())
     return {"saturated_pixels": count} if count else {}
+
+
+def steps_to(far: float) -> float:
+    """Steps in a unit, a power of ten, with which depth images reach twice as far as this.
+
+    Example:
+        >>> steps_to(10.0), steps_to(0.02), steps_to(5000.0)
+        (1000.0, 1000000.0, 1.0)
+    """
+    return float(10.0 ** math.floor(math.log10(MAX_STEPS / (2 * far))))
 
 
 def check_depth_fits(depth_range: tuple[float, float], options: OutputOptions) -> None:
@@ -138,30 +173,14 @@ def check_depth_fits(depth_range: tuple[float, float], options: OutputOptions) -
         return
     half = MAX_STEPS / (2 * far)  # networks may see beyond the range
     digits = 10.0 ** math.floor(math.log10(half))
+    unit = "m" if options.unit == "metre" else "units"
     raise UserError(
-        f"depth/N.png holds up to {options.max_depth:g} m, and depth is searched up to {far:g} m",
+        f"depth/N.png holds up to {options.max_depth:g} {unit}, and depth is searched up to "
+        f"{far:g} {unit}",
         "--depth-range",
-        f"add --depth-scale {half // digits * digits:g} for coarser steps, or search less far",
+        f"add --depth-scale {half // digits * digits:g} for coarser steps, --format npz (or tiff, "
+        "pfm) for float32, or search less far",
     )
-
-
-def write_depth_png(path: Path, depth: ArrayLike, *, scale: float = MILLIMETRES) -> None:
-    """Write ``(H, W)`` metres as 16-bit steps, millimetres if no other scale is given.
-
-    Unknown depth (0, negative, NaN, infinite) becomes 0; known depth stays known: below half
-    a step it is written as 1, beyond 65534 steps as that.
-    """
-    metres = np.asarray(depth, dtype=np.float64)
-    known = np.isfinite(metres) & (metres > 0)
-    steps = np.rint(scale * np.where(known, metres, 0)).clip(1, MAX_STEPS)
-    image = Image.fromarray(np.where(known, steps, 0).astype(np.uint16))
-    write_atomically(path, lambda file: image.save(file, format="PNG"))
-
-
-def read_depth_png(path: Path, *, scale: float = MILLIMETRES) -> NDArray[np.float32]:
-    """``(H, W)`` float32 metres of a file of `write_depth_png`, 0 where there is none."""
-    with Image.open(path) as image:
-        return (np.asarray(image) / np.float64(scale)).astype(np.float32)
 
 
 def write_confidence_png(path: Path, probability: ArrayLike) -> None:

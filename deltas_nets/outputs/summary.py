@@ -9,13 +9,15 @@ from typing import Any
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.products import MILLIMETRES
+from deltas_nets.outputs.depth_formats import MILLIMETRES
 
 WRITER = "deltas depth"
 """Stands in summary.json and tells our folders from others."""
 SUMMARY = "summary.json"
 SCALE = "depth_scale"
-"""The setting that is there where depth images are not in millimetres."""
+"""The setting that is there where a unit has not 1000 steps of a depth image."""
+FORMAT = "format"
+"""The setting that is there where depth maps are no PNG."""
 SHARD_SUMMARY = re.compile(r"summary\.\d+-of-\d+\.json")
 
 

@@ -1,0 +1,57 @@
+"""One line on whether maps can be trusted, from what the summary records of each."""
+
+from collections.abc import Mapping, Sequence
+from statistics import mean, median
+from typing import Any, NamedTuple
+
+__all__ = ["Verdict", "verdict"]
+
+USUAL_CONFIDENCE = 0.5
+"""The median over a capture of its maps' mean confidence: 0.50 to 0.62 of indoor captures with
+right poses, 0.12 to 0.16 with poses inverted or in OpenGL's axes."""
+LOW_CONFIDENCE = 0.3
+USUAL_SHARE = 0.5  # of keypoints that are triangulated
+
+
+class Verdict(NamedTuple):
+    """What is printed at the end, and stands in the summary.
+
+    Attributes:
+        line: a sentence.
+        doubtful: something is likely to be wrong.
+    """
+
+    line: str
+    doubtful: bool
+
+
+def verdict(records: Sequence[Mapping[str, Any]], *, short: int = 0) -> Verdict:
+    """What maps are like as a whole.
+
+    Args:
+        records: of frames, as `deltas_nets.predict.capture` writes them.
+        short: view sets with fewer views than asked.
+
+    Example:
+        >>> good = {"confidence": 0.55, "valid_points": 600, "keypoints": 800}
+        >>> verdict([good, good]).line
+        'mean confidence 0.55 (usual: 0.5 or more), 75 % of points triangulated'
+    """
+    sure = [record["confidence"] for record in records if "confidence" in record]
+    shares = [
+        record["valid_points"] / record["keypoints"]
+        for record in records
+        if record.get("keypoints", 0) > 0
+    ]
+    words, low = [], False
+    if sure:
+        low = median(sure) < LOW_CONFIDENCE
+        words.append(f"mean confidence {mean(sure):.2f} (usual: {USUAL_CONFIDENCE} or more)")
+    if shares:
+        low = low or median(shares) < 0.5 * USUAL_SHARE
+        words.append(f"{100 * mean(shares):.0f} % of points triangulated")
+    if short:
+        words.append(f"{short} view sets short of views")
+    if low:
+        words.append("the poses or intrinsics are likely wrong: run deltas check")
+    return Verdict(", ".join(words) or "nothing to judge by", low)

@@ -1,0 +1,142 @@
+"""What a few maps tell of a whole capture: how far its surfaces are, how long its unit is."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.known_depths import points_in_view
+from deltas_nets.captures.text_lines import read_lines
+from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.captures.working_depth import guessed_depth, knows_its_scale, working_depths
+from deltas_nets.errors import UserError
+from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.look import found_depths
+from deltas_nets.predict.predictor import Predictor
+from deltas_nets.predict.search import Followed
+
+__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor"]
+
+ANCHORS = 5
+"""Frames that are looked at."""
+ROUNDS = 3
+"""At most, until views chosen for a depth find that depth."""
+AGREES = 1.4
+ENOUGH = 50
+"""Pixels where map and sensor are compared."""
+
+
+def depth_seen(predictor: Predictor, capture: Capture, config: PredictConfig) -> float:
+    """How far typical surfaces are, in the capture's unit: as it knows, or as a first look finds.
+
+    Raises:
+        UserError: an image cannot be read, or there are fewer than two frames.
+    """
+    if knows_its_scale(capture):
+        return float(np.median(working_depths(capture)))
+    search, depth = Followed(capture), guessed_depth(capture)
+    for _ in range(ROUNDS):
+        found = [
+            found_depths(search(predictor, views, config).map)
+            for views in _some(capture, working_depth=depth)
+        ]
+        medians = [float(np.median(depths)) for depths in found if len(depths)]
+        if not medians:
+            break
+        before, depth = depth, float(np.median(medians))
+        if 1 / AGREES < depth / before < AGREES:
+            break
+    return depth
+
+
+def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfig) -> float:
+    """Metres in a unit of the capture, by its sensor depth.
+
+    It is compared with sparse points where frames see some, else with maps of a few frames.
+
+    Raises:
+        UserError: no frame has sensor depth that can be compared.
+    """
+    with_sensor = [id for id, frame in capture.frames.items() if frame.depth_path is not None]
+    ratios: list[float] = []
+    position = {id: number for number, id in enumerate(capture.frames)}
+    for id in _spread(with_sensor, 4 * ANCHORS):
+        ratios += _ratios_at_points(capture, position[id]).tolist()
+    if len(ratios) < ENOUGH:
+        search = Followed(capture)
+        for views in _some(capture, anchors=_spread(with_sensor, ANCHORS)):
+            depth = search(predictor, views, config).map.depth
+            measured = depth_at_image(capture.frame(views.anchor))
+            both = (depth > 0) & (measured > 0)
+            ratios += (measured[both] / depth[both])[:: 1 + int(both.sum()) // 1000].tolist()
+    if len(ratios) < ENOUGH:
+        what, remedy = "no sensor depth tells the scale", "give --scale METRES_PER_UNIT"
+        raise UserError(what, capture.path, remedy)
+    return float(np.median(ratios))
+
+
+def scale_by_measurements(
+    predictor: Predictor, capture: Capture, config: PredictConfig, file: Path
+) -> float:
+    """Metres in a unit of the capture, by depths that a person measured.
+
+    Args:
+        predictor: of a trained network.
+        capture: the frames.
+        config: sizes; the map is as large as the photo.
+        file: lines ``ID X Y METRES``: a frame, a pixel, and how far along the view what it shows
+            is from the camera.
+
+    Raises:
+        UserError: the file is malformed, or names a frame or pixel that there is not.
+    """
+    form = "write lines ID X Y METRES: a frame, a pixel and its depth"
+    search, ratios, maps = Followed(capture), [], {}
+    for number, words in read_lines(file, name="file of measured depths", remedy=form):
+        try:
+            id, (x, y, metres) = words[0], (float(word) for word in words[1:])
+        except ValueError as error:
+            raise UserError(f"line {number} is not ID X Y METRES", file, form) from error
+        if id not in maps:
+            (views,) = _some(capture, anchors=[capture.frame(id).id])
+            maps[id] = search(predictor, views, config).map.depth
+        row, column = round(y), round(x)
+        inside = 0 <= row < maps[id].shape[0] and 0 <= column < maps[id].shape[1]
+        if not (inside and metres > 0):
+            what = f"line {number}: no pixel ({x:g}, {y:g}) of frame {id} is {metres:g} m away"
+            raise UserError(what, file, form)
+        ratios.append(metres / float(maps[id][row, column]))
+    if not ratios:
+        raise UserError("the file of measured depths is empty", file, form)
+    return float(np.median(ratios))
+
+
+def _ratios_at_points(capture: Capture, position: int) -> FloatArray:
+    """Sensor depth of a frame by that of its sparse points, where both are known."""
+    points, frame = points_in_view(capture, position), capture.frames.at(position)
+    if points is None:
+        return np.zeros(0)
+    measured = depth_at_image(frame)
+    x, y, w = (points @ frame.K.T).T
+    column, row = np.rint(x / w).astype(int), np.rint(y / w).astype(int)
+    inside = (column >= 0) & (column < measured.shape[1]) & (row >= 0) & (row < measured.shape[0])
+    at = measured[row[inside], column[inside]]
+    ratios: FloatArray = (at / points[inside, 2])[at > 0]
+    return ratios
+
+
+def _some(
+    capture: Capture, *, working_depth: float | None = None, anchors: Sequence[str] | None = None
+) -> tuple[ViewSet, ...]:
+    chosen = _spread(list(capture.frames), ANCHORS) if anchors is None else anchors
+    return choose_view_sets(capture, 3, working_depth=working_depth, anchors=chosen)
+
+
+def _spread(ids: Sequence[str], count: int) -> list[str]:
+    """So many of the ids, evenly."""
+    places = np.linspace(0, len(ids) - 1, min(count, len(ids)))
+    return [ids[round(place)] for place in places]
