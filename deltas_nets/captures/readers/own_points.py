@@ -106,5 +106,6 @@ def _table(file: Path, columns: Sequence[str], *, least: int) -> FloatArray:
         detail = " ".join(str(error).split())[:120]
         what = f"not every line is of the numbers {names} ({detail})"
         raise UserError(what, file, REMEDY) from error
-    table = table.reshape(-1, len(given))
-    return table
+    if table.size and table.shape[1] != len(given):
+        raise UserError(f"the lines are not all of {names}", file, REMEDY)
+    return table.reshape(-1, len(given))

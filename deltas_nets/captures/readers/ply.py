@@ -69,7 +69,7 @@ def _header(path: Path, start: bytes) -> tuple[int, str, int, list[tuple[str, st
             if words[1] == "vertex" and words[2].isdigit() and len(words[2]) < 12:
                 count = int(words[2])
         elif words[:1] == ["property"] and elements[-1:] == ["vertex"]:
-            columns.append((words[-1], words[1]))
+            columns.append((words[-1], words[1] if len(words) == 3 else "list"))
     known = all(type in TYPES for _, type in columns)
     names = {name for name, _ in columns}
     if form not in (*ORDERS, "ascii") or count < 0 or not known or len(names) < len(columns):
