@@ -36,13 +36,15 @@ def read_pfm(data: bytes, path: Path) -> NDArray[np.float32]:
 
 
 def read_npy(data: bytes, path: Path) -> NDArray[np.float32]:
-    """A map of floats, ``(H, W)``; dimensions of 1 are left out.
+    """A map of floats, ``(H, W)``; a third dimension of 1 is left out.
 
     Raises:
         UserError: as `read_npy_array`, or it is no map.
     """
     array = read_npy_array(data, path)
-    kept = tuple(size for size in array.shape if size != 1)
+    kept = array.shape
+    if len(kept) == 3 and 1 in (kept[0], kept[2]):
+        kept = kept[1:] if kept[0] == 1 else kept[:2]
     if len(kept) != 2:
         raise UserError(f"the NPY file has shape {array.shape}, no map", path, _AGAIN)
     with np.errstate(over="ignore"):

@@ -40,13 +40,9 @@ def seen_in(capture: Capture, ids: Sequence[str]) -> list[Seen]:
 
 def true_matches(a: Path, b: Path) -> tuple[np.ndarray, np.ndarray]:
     """SIFT matches that some fundamental matrix explains, whatever the poses say."""
-    sift = cv2.SIFT_create(3000)
-    (at, of_a), (bt, of_b) = (
-        sift.detectAndCompute(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | 128), None)
-        for path in (a, b)
-    )
+    (at, of_a), (bt, of_b) = map(_keypoints, (a, b))
     pairs = [
-        (at[first.queryIdx].pt, bt[first.trainIdx].pt)
+        (at[first.queryIdx], bt[first.trainIdx])
         for first, second in cv2.BFMatcher().knnMatch(of_a, of_b, k=2)
         if first.distance < 0.75 * second.distance
     ]
@@ -56,6 +52,16 @@ def true_matches(a: Path, b: Path) -> tuple[np.ndarray, np.ndarray]:
     kept = pixels[inside.ravel() > 0]
     assert len(kept) > 50
     return kept[:, 0], kept[:, 1]
+
+
+def _keypoints(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    smaller = 1
+    while image.shape[1] > 1700:
+        image, smaller = cv2.pyrDown(image), 2 * smaller
+    found, described = cv2.SIFT_create(3000).detectAndCompute(image, None)
+    # Pixel x of the smaller image is centred on pixel 2 x of the larger, as pyrDown samples it.
+    return smaller * np.array([keypoint.pt for keypoint in found]), described
 
 
 def residual(a: Seen, b: Seen, matches: tuple[np.ndarray, np.ndarray]) -> float:

@@ -6,14 +6,13 @@ import numpy as np
 
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.images import in_words
+from deltas_nets.captures.readers.image_sizes import at_size
 from deltas_nets.errors import UserError
 
 __all__ = ["CORNER", "camera_matrix", "fitted"]
 
 CORNER = 0.5
 """What is subtracted from principal points of programs that put the image's corner at 0."""
-
-_ASPECT = 0.02
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, path: Path) -> FloatArray:
@@ -38,30 +37,25 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, path: Path) -> 
 
 
 def fitted(
-    K: FloatArray, stated: tuple[int, int], actual: tuple[int, int], *, path: Path
+    K: FloatArray, stated: tuple[int, int], size: tuple[int, int], *, image: Path
 ) -> FloatArray:
-    """Intrinsics of images of another size than the file states.
+    """Intrinsics for an image of another size than the capture states.
 
     Args:
         K: ``(3, 3)`` of images of the stated size.
         stated: (height, width) that the intrinsics are for.
-        actual: (height, width) of the images.
-        path: the file that states them.
+        size: (height, width) of the image.
+        image: the file, for errors.
 
     Returns:
         ``(3, 3)``, read-only.
 
     Raises:
-        UserError: the images have another shape: they are turned or cropped.
+        UserError: one is no resized version of the other: the image is turned or cropped.
     """
-    if stated == actual:
+    if stated == size:
         return K
-    down, across = actual[0] / max(stated[0], 1e-9), actual[1] / max(stated[1], 1e-9)
-    if not abs(down / across - 1) <= _ASPECT if across else True:
-        what = f"the intrinsics are for {in_words(stated)}, the image is {in_words(actual)}"
-        raise UserError(what, path, "undo the crop or the turn of the images")
-    shift_x, shift_y = (across - 1) / 2, (down - 1) / 2
-    change = np.array([[across, 0, shift_x], [0, down, shift_y], [0, 0, 1]])
-    scaled: FloatArray = change @ K
-    scaled.setflags(write=False)
-    return scaled
+    if min(stated) < 1:
+        what = f"the camera is said to have {in_words(stated)} pixels"
+        raise UserError(what, image, "state the size that the intrinsics are for")
+    return at_size(K, None, stated=stated, size=size, image=image).K

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from deltas_geom.cameras.lenses.models import MODELS
 from deltas_nets.captures.capture import Capture, Lost
 from deltas_nets.captures.frame import FloatArray, Frame, Lens
 from deltas_nets.captures.frames import Frames
@@ -23,18 +24,8 @@ __all__ = ["LAYOUT", "read", "recognises"]
 
 LAYOUT = "sensors/sensors.txt, records_camera.txt and trajectories.txt (kapture)"
 _REMEDY = "write it as kapture 1.1 does: values between commas"
-_FOCALS = {
-    "SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2,
-    "OPENCV_FISHEYE": 2, "FULL_OPENCV": 2, "FOV": 2, "SIMPLE_RADIAL_FISHEYE": 1,
-    "RADIAL_FISHEYE": 1, "THIN_PRISM_FISHEYE": 2,
-}  # fmt: skip
-"""How many focal lengths a model has; two of the principal point and the lens follow."""
-_COEFFICIENTS = {
-    "SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4,
-    "OPENCV_FISHEYE": 4, "FULL_OPENCV": 8, "FOV": 1, "SIMPLE_RADIAL_FISHEYE": 1,
-    "RADIAL_FISHEYE": 2, "THIN_PRISM_FISHEYE": 8,
-}  # fmt: skip
-
+_STRAIGHT = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
+"""Models that bend nothing where their coefficients are 0."""
 MOST_RIGS = 8
 """That a sensor is on. All are tried for each of its images."""
 
@@ -102,7 +93,7 @@ def read(path: Path) -> Capture:
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(sensor.K, sensor.size, size, path=folder / "sensors.txt"),
+                K=fitted(sensor.K, sensor.size, size, image=image),
                 lens=sensor.lens,
                 cam_from_world=pose,
             )
@@ -142,11 +133,11 @@ def _sensors(path: Path) -> Mapping[str, _Sensor]:
         if words[2].lower() != "camera":
             continue
         model = words[3].upper() if len(words) > 3 else ""
-        if model not in _FOCALS:
+        if model not in MODELS or model == "EQUIRECTANGULAR":
             what = f"line {line} has a camera of the model {model[:40]!r}, which is not read"
             raise UserError(what, path, "calibrate the camera, or convert it to one of COLMAP's")
         numbers = _numbers(words[4:], line, path)
-        focals, bends = _FOCALS[model], _COEFFICIENTS[model]
+        focals, bends = MODELS[model].focals, len(MODELS[model].coefficients)
         if len(numbers) != 4 + focals + bends:
             what = f"line {line} has {len(numbers)} numbers, not the {4 + focals + bends}"
             raise UserError(f"{what} of {model}", path, _REMEDY)
@@ -155,7 +146,7 @@ def _sensors(path: Path) -> Mapping[str, _Sensor]:
         fx, fy = numbers[2], numbers[1 + focals]
         cx, cy = numbers[2 + focals : 4 + focals]
         coefficients = tuple(numbers[4 + focals :])
-        straight = not any(coefficients) and "FISHEYE" not in model
+        straight = not any(coefficients) and model in _STRAIGHT
         sensors[words[0]] = _Sensor(
             (int(numbers[1]), int(numbers[0])),
             camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=path),

@@ -87,7 +87,7 @@ def read(path: Path) -> Capture:
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(K, view.size, size, path=file),
+                K=fitted(K, view.size, size, image=image),
                 lens=lens,
                 cam_from_world=pose,
             )

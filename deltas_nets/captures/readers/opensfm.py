@@ -88,7 +88,7 @@ def read(path: Path) -> Capture:
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(K, stated, size, path=file),
+                K=fitted(K, stated, size, image=image),
                 lens=lens,
                 cam_from_world=pose,
             )

@@ -72,7 +72,7 @@ def read(path: Path) -> Capture:
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=_intrinsics(fields, size),
+                K=_intrinsics(fields, size, image),
                 cam_from_world=pose,
                 depth_path=depth if depth.is_file() else None,
             )
@@ -93,12 +93,12 @@ def _holds_json(folder: Path) -> bool:
     return any(file.suffix.lower() == ".json" for file in folder.iterdir())
 
 
-def _intrinsics(fields: Fields, size: tuple[int, int]) -> FloatArray:
+def _intrinsics(fields: Fields, size: tuple[int, int], image: Path) -> FloatArray:
     """ARKit measures the principal point from the corner of the image."""
     fx, fy, cx, cy = (fields.number(name) for name in ("fx", "fy", "cx", "cy"))
     K = camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=fields.path)
     stated = int(fields.number("height", size[0])), int(fields.number("width", size[1]))
-    return fitted(K, stated, size, path=fields.path)
+    return fitted(K, stated, size, image=image)
 
 
 def _pose(fields: Fields, id: str, path: Path) -> FloatArray | Lost:

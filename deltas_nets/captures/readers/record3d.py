@@ -61,7 +61,7 @@ def read(path: Path) -> Capture:
                 id=id,
                 image_path=images[number],
                 image_size=size,
-                K=fitted(K, stated, size, path=file),
+                K=fitted(K, stated, size, image=images[number]),
                 cam_from_world=pose,
                 depth_path=depths.get(number),
             )

@@ -61,7 +61,7 @@ def read(path: Path) -> Capture:
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(matrix, stated, size, path=file),
+                K=fitted(matrix, stated, size, image=image),
                 cam_from_world=pose,
             )
         )
