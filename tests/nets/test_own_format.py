@@ -1,6 +1,7 @@
 """Our own format: what docs/captures.md promises, and one line of error for everything else."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,29 @@ def test_the_shortest_file(tmp_path: Path) -> None:
     assert (first.cam_from_world[2, 3], second.cam_from_world[2, 3]) == (-2, 2)
     assert capture.metric and capture.points is None and capture.depth_ranges is None
     assert not open_capture(write(tmp_path, units="unknown")).metric
+
+
+def test_the_page_that_describes_it_is_right(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
+    blocks = dict(
+        re.findall(r"^```(json|python)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    )
+    table = re.search(r"^```\n(# units.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    assert table is not None
+    for name in ("0.jpg", "1.jpg"):
+        (tmp_path / "images").mkdir(exist_ok=True)
+        shutil.copy(image_of((480, 640)), tmp_path / "images" / name)
+    (tmp_path / "frames.json").write_text(blocks["json"])
+    first = open_capture(tmp_path)
+    (tmp_path / "frames.json").rename(tmp_path / "old.json")
+    (tmp_path / "frames.csv").write_text(table[1])
+    second = open_capture(tmp_path)
+    names: dict[str, Any] = {}
+    exec(blocks["python"], names)
+    poses = np.linalg.inv(first.frames.cam_from_world)
+    names["write_frames"](tmp_path, ["images/0.jpg", "images/1.jpg"], poses, first.frames.K[0])
+    (tmp_path / "frames.csv").unlink()
+    assert first.fingerprint() == second.fingerprint() == open_capture(tmp_path).fingerprint()
 
 
 def test_the_file_itself_may_be_named(tmp_path: Path) -> None:
