@@ -18,7 +18,7 @@ from deltas_nets.captures.images import resize_image
 
 __all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight"]
 
-WIDEST = np.cos(np.radians(55))
+WIDEST = np.cos(np.radians(60))
 """What a lens sees farther off its axis is left out: a straight image of it would be all border."""
 _ACROSS = 33  # pixels of the photo, along each side, that the straight image is made to hold
 _FINER = 2  # times the wanted size, at which an image is straightened before it is made smaller

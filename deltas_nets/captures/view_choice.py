@@ -231,7 +231,7 @@ def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> li
     left = log_score.copy()
     chosen: list[int] = []
     for _ in range(min(count, len(log_score))):
-        best = int(np.argmax(left - repeated))
+        best = int(np.argmax(np.round(left - repeated, 9)))  # the first of equals
         chosen.append(best)
         left[best] = -np.inf
         gap = np.linalg.norm(offsets - offsets[best], axis=-1) / lengths[best].clip(1e-9)

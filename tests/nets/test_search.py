@@ -1,0 +1,192 @@
+"""What is searched follows from the capture, in any unit; an oracle stands for the network."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.known_depths import farthest_depth, known_depths
+from deltas_nets.captures.points import Observations, SparsePoints
+from deltas_nets.captures.scaled import scaled
+from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.working_depth import guessed_depth, knows_its_scale, working_depths
+from deltas_nets.errors import UserError
+from deltas_nets.outputs.verdict import verdict
+from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig
+from deltas_nets.predict.first_look import depth_seen, scale_by_measurements, scale_by_sensor
+from deltas_nets.predict.look import look
+from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of
+from deltas_nets.predict.search import Asked, Followed
+
+VIEWS = ViewSet("1", ("0", "2"))
+UNITS = st.floats(-3, 3).map(lambda power: float(10**power))
+
+
+class Oracle:
+    """Finds a wall where it is, or the end of the range that is nearest to it."""
+
+    def __init__(self, wall: float) -> None:
+        self.wall = wall
+        self.asked: list[tuple[float, float]] = []
+
+    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+        self.asked.append(config.depth_range)
+        baseline = np.linalg.norm((frames[1].cam_from_world - frames[0].cam_from_world)[:3, 3])
+        depth = float(np.clip(self.wall * baseline / 0.15, *config.depth_range))
+        size = frames[0].image_size
+        keypoints = KeypointDepths(torch.zeros(9, 2), torch.full((9,), depth), size)
+        map = np.full(size, depth, dtype=np.float32)
+        points = np.array([[0.0, 0.0, depth]])
+        return DepthMap(map, np.ones_like(map), points, np.zeros((1, 3), np.uint8), keypoints)
+
+
+def with_points(capture: Capture, wall: float, *, seen: bool = True) -> Capture:
+    """With a grid of sparse points on a wall at a depth."""
+    xyz = np.stack(np.broadcast_arrays(*np.mgrid[-1:1:8j, -1:1:8j], 0.0), axis=-1).reshape(-1, 3)
+    xyz = xyz * wall / 4 + [0.08 * wall, 0, wall]
+    frames, count = len(capture.frames), len(xyz)
+    observed = Observations(
+        np.tile(np.arange(count), frames), np.repeat(np.arange(frames), count), np.zeros((0, 2))
+    )
+    told = observed if seen else Observations.none()
+    points = SparsePoints(xyz, np.zeros_like(xyz, np.uint8), np.zeros(count), told)
+    return replace(capture, points=points)
+
+
+@given(
+    depths=st.lists(st.floats(0.01, 100), min_size=1, max_size=30), unit=UNITS, metric=st.booleans()
+)
+def test_a_search_holds_what_is_known_and_scales_with_the_unit(
+    depths: list[float], unit: float, metric: bool
+) -> None:
+    reach = reach_of(depths, metric=metric)
+    low, median, high = np.percentile(depths, (2, 50, 98))
+    assert reach.near <= low and reach.far >= high
+    assert reach.near * reach.unit <= ROOM[0] * 1.001 and reach.far * reach.unit >= ROOM[1] * 0.999
+    if not metric:
+        assert reach.unit * median == pytest.approx(2.5)
+        other = reach_of(np.array(depths) * unit, metric=False)
+        assert np.allclose(other, [reach.near * unit, reach.far * unit, reach.unit / unit])
+    elif 1 <= median <= 6:
+        assert reach.unit == 1
+
+
+@pytest.mark.parametrize(
+    ("wall", "end"), [(0.01, "near"), (0.7, None), (2.5, None), (7.0, None), (90.0, "far")]
+)
+def test_points_pile_up_at_the_end_that_is_too_near(wall: float, end: str | None) -> None:
+    depths = np.clip(np.linspace(0.9, 1.1, 50) * wall, *ROOM)
+    assert end_of_pile(depths, Reach(*ROOM)) == end
+    assert end_of_pile([], Reach(*ROOM)) is None
+
+
+@pytest.mark.parametrize("wall", [0.004, 0.3, 2.5, 80.0])
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_wall_is_found_wherever_it_is(capture: Capture, wall: float, metric: bool) -> None:
+    found = Followed(replace(no_sensor(capture), metric=metric))(
+        Oracle(wall), VIEWS, PredictConfig()
+    )
+    assert np.allclose(found.map.depth, wall, rtol=1e-5) and found.piled is None
+    assert found.reach.near < wall < found.reach.far
+    assert found.map.points[0, 2] == pytest.approx(wall)
+
+
+def test_a_room_in_metres_is_searched_once_as_ever(capture: Capture) -> None:
+    oracle = Oracle(2.5)
+    assert Followed(capture)(oracle, VIEWS, PredictConfig()).reach == Reach(*ROOM)
+    assert oracle.asked == [ROOM]
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_sparse_points_spare_the_first_look(capture: Capture, seen: bool) -> None:
+    known = with_points(replace(no_sensor(capture), metric=False), 0.3, seen=seen)
+    oracle = Oracle(0.3)
+    found = Followed(known)(oracle, VIEWS, PredictConfig())
+    assert len(oracle.asked) == 1 and np.allclose(found.map.depth, 0.3)
+    assert farthest_depth(known) == pytest.approx(0.3)
+    depths = known_depths(known, 1)
+    assert depths is not None and np.allclose(depths, 0.3)
+
+
+def test_a_range_that_is_asked_for_is_what_is_searched(capture: Capture) -> None:
+    oracle = Oracle(80.0)
+    found = Asked(capture, (1.0, 4.0))(oracle, VIEWS, PredictConfig())
+    assert oracle.asked == [(1.0, 4.0)] and found.piled == "far"
+
+
+@given(unit=UNITS)
+def test_maps_and_views_do_not_depend_on_the_unit(unit: float) -> None:
+    capture = replace(orbit(), metric=False)
+    other = scaled(capture, unit, metric=False)
+    assert guessed_depth(other) == pytest.approx(unit * guessed_depth(capture))
+    assert choose_view_sets(other, 3) == choose_view_sets(capture, 3)
+    for known in (capture, with_points(capture, 2.0)):
+        again = scaled(known, unit, metric=False)
+        assert np.allclose(working_depths(again), unit * working_depths(known))
+        assert knows_its_scale(again) == knows_its_scale(known) == (known.points is not None)
+
+
+def test_cameras_that_look_at_one_thing_tell_how_far_it_is() -> None:
+    assert guessed_depth(orbit(radius=3.0)) == pytest.approx(3.0, rel=1e-6)
+
+
+def test_a_look_in_another_unit_comes_back_in_the_captures(capture: Capture) -> None:
+    frames = [capture.frame(id) for id in ("1", "0", "2")]
+    plain = look(Oracle(2.5), frames, PredictConfig(), Reach(0.5, 10.0))  # type: ignore[arg-type]
+    other = look(Oracle(2.5), frames, PredictConfig(), Reach(0.5, 10.0, 7.0))  # type: ignore[arg-type]
+    assert np.allclose(other.depth, plain.depth) and np.allclose(other.points, plain.points)
+    assert torch.allclose(other.keypoints.depth, plain.keypoints.depth)
+
+
+def test_the_scale_is_found_by_sensor_and_by_hand(capture: Capture, tmp_path: Path) -> None:
+    small = scaled(capture, 0.1, metric=False)  # its sensor measured 2.5 m, a wall is at 0.25
+    oracle, config = Oracle(2.5), PredictConfig()
+    assert depth_seen(oracle, small, config) == pytest.approx(0.25)  # type: ignore[arg-type]
+    assert scale_by_sensor(oracle, small, config) == pytest.approx(10)  # type: ignore[arg-type]
+    by_points = with_points(small, 0.25)
+    assert scale_by_sensor(Oracle(99.0), by_points, config) == pytest.approx(10)  # type: ignore[arg-type]
+    file = tmp_path / "measured.txt"
+    file.write_text("# tape\n1 10 20 2.5\n2 3.2 4 2.4\n0 5 5 2.6\n")
+    assert scale_by_measurements(oracle, small, config, file) == pytest.approx(10)  # type: ignore[arg-type]
+    for text in ("1 10 20", "1 10 20 -3", "1 999 20 2", "1 x 20 2", "", "nobody 1 1 1"):
+        file.write_text(text)
+        with pytest.raises(UserError):
+            scale_by_measurements(oracle, small, config, file)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="no sensor depth"):
+        scale_by_sensor(oracle, no_sensor(small), config)  # type: ignore[arg-type]
+
+
+def test_a_verdict_doubts_low_confidence_and_few_points() -> None:
+    good = {"confidence": 0.55, "valid_points": 700, "keypoints": 768}
+    assert not verdict([good] * 3).doubtful
+    assert verdict([good | {"confidence": 0.15}] * 2 + [good]).doubtful
+    assert verdict([good | {"valid_points": 9}] * 2 + [good]).doubtful
+    assert "2 view sets" in verdict([good], short=2).line
+    assert not verdict([{"status": "kept"}]).doubtful
+
+
+def no_sensor(capture: Capture) -> Capture:
+    frames = [replace(frame, depth_path=None) for frame in capture.frames.values()]
+    return replace(capture, frames=Frames.of(frames, capture.frames.folder))
+
+
+def orbit(radius: float = 2.0, count: int = 12) -> Capture:
+    """Cameras on a circle that look at its centre."""
+    K = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
+    frames = []
+    for number in range(count):
+        cos, sin = np.cos(number / 6), np.sin(number / 6)
+        pose = np.eye(4)
+        pose[:3, :3] = [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]
+        pose[2, 3] = radius
+        frames.append(Frame(str(number), Path(f"{number}.jpg"), (48, 64), K, pose))
+    return Capture(Path("orbit"), Frames.of(frames), {})
