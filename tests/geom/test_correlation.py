@@ -103,50 +103,6 @@ def test_lengths_are_those_of_the_sampled_features(scene: tuple[Tensor, Tensor, 
         assert_close(scores, wanted, rtol=0, atol=atol)
 
 
-@given(scene=scenes(), other=scenes(), factor=st.floats(-10, 10))
-def test_correlation_is_linear_in_both_factors(
-    scene: tuple[Tensor, Tensor, Tensor], other: tuple[Tensor, Tensor, Tensor], factor: float
-) -> None:
-    (first, features, pixels), (second, more, _) = scene, other
-    samples = samples_at(pixels)
-    for function in (correlate, correlate_normalized):
-        both = function(first + factor * second, features, samples, image_size=SIZE)
-        one = function(first, features, samples, image_size=SIZE)
-        two = function(second, features, samples, image_size=SIZE)
-        assert_close(both, one + factor * two, rtol=0, atol=1e-11)
-    both = correlate(first, features + factor * more, samples, image_size=SIZE)
-    one = correlate(first, features, samples, image_size=SIZE)
-    two = correlate(first, more, samples, image_size=SIZE)
-    assert_close(both, one + factor * two, rtol=0, atol=1e-11)
-
-
-@given(scene=scenes(), scale=st.floats(1e-3, 1e3))
-def test_a_normalized_score_is_a_cosine(scene: tuple[Tensor, Tensor, Tensor], scale: float) -> None:
-    descriptors, features, pixels = scene
-    unit = F.normalize(descriptors, dim=-1)
-    scores = correlate_normalized(unit, features, samples_at(pixels), image_size=SIZE)
-    assert (scores.abs() <= 1 + 1e-12).all()
-    scaled = correlate_normalized(unit, scale * features, samples_at(pixels), image_size=SIZE)
-    assert_close(scaled, scores, rtol=0, atol=1e-12)
-
-
-@given(scene=scenes(), steps=st.tuples(st.integers(-2, 2), st.integers(-2, 2)))
-def test_a_map_and_its_samples_shift_together(
-    scene: tuple[Tensor, Tensor, Tensor], steps: tuple[int, int]
-) -> None:
-    descriptors, features, pixels = scene
-    # The outer two centres of each side roll over to the other side.
-    inner = torch.tensor([9.5, 9.5]) + (pixels + 0.5) / torch.tensor([32, 24]) * torch.tensor(
-        [12, 4]
-    )
-    moved = inner + 4 * torch.tensor(steps)
-    rolled = features.roll(steps, dims=(-1, -2))
-    for function in (correlate, correlate_normalized):
-        scores = function(descriptors, features, samples_at(inner), image_size=SIZE)
-        shifted = function(descriptors, rolled, samples_at(moved), image_size=SIZE)
-        assert_close(shifted, scores, rtol=0, atol=1e-12)
-
-
 @BOTH
 @given(scene=scenes(), drawn=vectors(5, within=1.0, size=2))
 def test_what_is_masked_may_lie_anywhere(
@@ -277,7 +233,7 @@ def test_first_and_second_derivatives_are_right(function: Correlation) -> None:
     fixed = (*leaves[:2], leaves[2].detach())
     for inputs in (leaves, fixed):
         assert torch.autograd.gradcheck(score, inputs)
-        assert torch.autograd.gradgradcheck(score, inputs)
+        assert torch.autograd.gradgradcheck(score, inputs, fast_mode=True)
 
 
 @BOTH
@@ -338,7 +294,7 @@ NEEDS_COMPILER = pytest.mark.skipif(
 # What torch.compile does before a compiler sees the graph is what may break.
 @pytest.mark.parametrize(
     "backend",
-    ["aot_eager", pytest.param("inductor", marks=NEEDS_COMPILER)],
+    ["aot_eager", pytest.param("inductor", marks=(NEEDS_COMPILER, pytest.mark.slow))],
 )
 def test_both_compile_without_a_graph_break(backend: str) -> None:
     *leaves, pixels = random_scene()

@@ -73,20 +73,6 @@ def test_soft_argmax_is_shift_equivariant(
     assert_close(moved.entropy, found.entropy, rtol=0, atol=1e-10)
 
 
-@given(logits=vectors(1, within=5.0, size=7), positions=vectors(7, within=10.0, size=1))
-def test_soft_argmax_is_the_mean_and_variance_of_the_softmax(
-    logits: Tensor, positions: Tensor
-) -> None:
-    found = soft_argmax(logits[0], positions)
-    probability, x = logits[0].softmax(dim=-1).numpy(), positions[:, 0].numpy()
-    mean = (probability * x).sum()
-    assert found.position.item() == pytest.approx(mean, abs=1e-12)
-    assert found.covariance.item() == pytest.approx(
-        (probability * (x - mean) ** 2).sum(), abs=1e-10
-    )
-    assert found.peak.item() == pytest.approx(probability.max(), abs=1e-14)
-
-
 @given(left=vectors(1, within=1.0, size=3), positions=vectors(7, within=10.0, size=2))
 def test_a_window_leaves_the_other_mode_out(left: Tensor, positions: Tensor) -> None:
     logits = torch.cat([left[0] + 5, torch.zeros(1), left[0]])  # a second mode of e^-5
