@@ -6,6 +6,7 @@ Nothing heavy is imported before a command runs, so that --help is instant.
 import sys
 
 from deltas_nets.commands.calibrate import Calibrate
+from deltas_nets.commands.check import Check
 from deltas_nets.commands.command_line import run
 from deltas_nets.commands.convert import Convert
 from deltas_nets.commands.cost import Cost
@@ -17,7 +18,7 @@ from deltas_nets.commands.export import Export
 from deltas_nets.commands.recipe import Recipe
 from deltas_nets.commands.train import Train
 
-COMMANDS = (Demo, Depth, Convert, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
+COMMANDS = (Demo, Depth, Check, Convert, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ ABOVE = {
         "diagnosis modules testing"
     ),
     "deltas_nets": (
-        "errors terminal config captures network outputs weights_file losses reference rooms "
+        "errors terminal config captures network check outputs weights_file losses reference rooms "
         "datasets cost predict evaluate distill teachers export train commands cli"
     ),
 }

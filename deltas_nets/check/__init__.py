@@ -1,0 +1,1 @@
+"""What is wrong with a capture: a verdict, its evidence, and the cure."""

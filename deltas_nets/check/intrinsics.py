@@ -1,0 +1,115 @@
+"""Camera matrices that no camera has, or that are of other images."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.check.finding import Fault, Finding
+from deltas_nets.check.mending import changing_frames
+from deltas_nets.check.rewrite import of_size, swapped, with_K
+
+__all__ = ["wrong_intrinsics"]
+
+FOCAL = (0.15, 20.0)
+"""Of the longer side: an angle of view of 147 degrees, and one of 3."""
+SHAPES = (0.6, 1.7)  # fy / fx
+CENTRAL = 0.08  # parts of the image that a principal point is off the middle, if nobody cropped
+AGREEING = 0.04  # parts within which both axes tell of the same size
+
+
+class _Suspicion(NamedTuple):
+    """What is wrong with one K.
+
+    Attributes:
+        cause: what.
+        evidence: the figures.
+        cure: in words.
+        right: ``(3, 3)`` what K should be, if that follows.
+    """
+
+    cause: Fault
+    evidence: str
+    cure: str
+    right: FloatArray | None
+
+
+def wrong_intrinsics(capture: Capture) -> list[Finding]:
+    """A finding for each kind of nonsense, with the frames of all cameras that have it."""
+    arrays = capture.frames.arrays
+    suspicions = [_suspicion(camera.K, camera.image_size) for camera in arrays.cameras]
+    return list(_by_cause(capture, suspicions))
+
+
+def _by_cause(capture: Capture, suspicions: list[_Suspicion | None]) -> Iterator[Finding]:
+    camera_of = capture.frames.arrays.camera_of
+    for cause in dict.fromkeys(one.cause for one in suspicions if one is not None):
+        known = [(i, one) for i, one in enumerate(suspicions) if one and one.cause is cause]
+        mask = np.isin(camera_of, [camera for camera, _ in known])
+        if not mask.any():
+            continue
+        ids = () if mask.all() else tuple(capture.frames.kept(mask))
+        first = known[0][1]
+        right = {camera: one.right for camera, one in known if one.right is not None}
+        mend = (
+            changing_frames(with_K(dict(enumerate(_rights(camera_of, right))))) if right else None
+        )
+        yield Finding(cause, first.evidence, ids, first.cure, "error", mend)
+
+
+def _rights(camera_of: np.ndarray, right: dict[int, FloatArray]) -> list[FloatArray | None]:
+    return [right.get(int(camera)) for camera in camera_of]
+
+
+def _suspicion(K: FloatArray, image_size: tuple[int, int]) -> _Suspicion | None:
+    height, width = image_size
+    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        focal = f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px"
+        return _Suspicion(Fault.NONSENSE_CALIBRATION, focal, "calibrate the camera", None)
+    if abs(K[2, :2]).max() > 1 and abs(K[:2, 2]).max() < 1:
+        evidence = f"the principal point ({K[2, 0]:g}, {K[2, 1]:g}) is in the last row"
+        return _Suspicion(Fault.K_TRANSPOSED, evidence, f"write K as {in_a_line(K.T)}", K.T.copy())
+    relative, shape = max(K[0, 0], K[1, 1]) / max(image_size), K[1, 1] / K[0, 0]
+    if not FOCAL[0] <= relative <= FOCAL[1] or not SHAPES[0] <= shape <= SHAPES[1]:
+        evidence = (
+            f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px for images of {width}x{height}, "
+            f"{relative:.2g} times their longer side"
+        )
+        cure = "calibrate the camera; photos of a phone are about 0.7 to 0.9 times the longer side"
+        return _Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, None)
+    return _of_other_images(K, image_size)
+
+
+def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> _Suspicion | None:
+    height, width = image_size
+    right, down = (K[0, 2] + 0.5) / width - 0.5, (K[1, 2] + 0.5) / height - 0.5
+    point = f"the principal point ({K[0, 2]:.6g}, {K[1, 2]:.6g}) of images of {width}x{height}"
+    if min(abs(right), abs(down)) <= CENTRAL:
+        return None
+    other = swapped(K)
+    off = abs((other[0, 2] + 0.5) / width - 0.5), abs((other[1, 2] + 0.5) / height - 0.5)
+    if right * down < 0 and max(off) < CENTRAL:
+        evidence = f"{point} is in the middle of images of {height}x{width}"
+        return _Suspicion(Fault.SIDES_SWAPPED, evidence, f"write K as {in_a_line(other)}", other)
+    factor = 0.5 / (0.5 + (right + down) / 2)
+    if abs(right - down) < AGREEING and factor > 0:
+        evidence = f"{point} is in the middle of images {1 / factor:.3g} times as large"
+        other = of_size(K, factor)
+        cure = f"scale it: K times {factor:.4g} is {in_a_line(other)}"
+        return _Suspicion(Fault.K_OF_OTHER_SIZE, evidence, cure, other)
+    if max(abs(right), abs(down)) > 0.5:
+        evidence = f"{point} is outside of them"
+        return _Suspicion(Fault.NONSENSE_CALIBRATION, evidence, "calibrate the camera", None)
+    return None
+
+
+def in_a_line(K: FloatArray) -> str:
+    """K as people read it.
+
+    Example:
+        >>> in_a_line(np.diag([500.0, 501.5, 1.0]))
+        'fx 500 fy 501.5 cx 0 cy 0'
+    """
+    return f"fx {K[0, 0]:.6g} fy {K[1, 1]:.6g} cx {K[0, 2]:.6g} cy {K[1, 2]:.6g}"

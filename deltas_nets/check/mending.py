@@ -1,0 +1,54 @@
+"""Changes of a capture that cures are made of: other cameras, fewer frames."""
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from deltas_nets.captures.capture import Capture, FloatArray, Lost
+from deltas_nets.captures.frames import Frames
+from deltas_nets.check.finding import Mend
+from deltas_nets.errors import UserError
+
+__all__ = ["BY_COMMAND", "changing_frames", "changing_poses", "leaving_out"]
+
+BY_COMMAND = "deltas check CAPTURE --mend OUT writes the capture with this mended"
+"""What all cures of this kind say; the command puts in the names."""
+
+
+def changing_poses(change: Callable[[FloatArray], FloatArray]) -> Mend:
+    """A mend by a function of all poses ``(F, 4, 4)``, cam_from_world."""
+
+    def mend(capture: Capture) -> Capture:
+        frames = capture.frames
+        poses = change(frames.cam_from_world.copy())
+        arrays = frames.arrays._replace(cam_from_world=poses)
+        return replace(capture, frames=Frames(frames.folder, arrays, memory=frames.memory))
+
+    return mend
+
+
+def changing_frames(change: Callable[[int, Any], Any]) -> Mend:
+    """A mend by a function that is given the position of a frame and the frame."""
+
+    def mend(capture: Capture) -> Capture:
+        changed = [change(*item) for item in enumerate(capture.frames.values())]
+        frames = Frames.of(changed, capture.frames.folder)
+        if capture.frames.memory is not None:
+            frames = frames.remembering(capture.frames.memory)
+        return replace(capture, frames=frames)
+
+    return mend
+
+
+def leaving_out(ids: Collection[str]) -> Mend:
+    """A mend by taking frames out."""
+    gone = frozenset(ids)
+
+    def mend(capture: Capture) -> Capture:
+        mask = np.array([id in gone for id in capture.frames], dtype=np.bool_)
+        error = UserError("the frame is left out", capture.path, "see deltas check")
+        return capture.without(mask, Lost("listed", error))
+
+    return mend

@@ -1,0 +1,41 @@
+"""Camera matrices as they should have been written."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from deltas_nets.captures.frame import FloatArray, Frame
+
+__all__ = ["of_size", "swapped", "with_K", "with_focal"]
+
+
+def of_size(K: FloatArray, factor: float) -> FloatArray:
+    """K of images ``factor`` times as large; pixel centres stay at integers."""
+    half = factor / 2 - 0.5
+    scaled: FloatArray = np.array([[factor, 0, half], [0, factor, half], [0, 0, 1]]) @ K
+    return scaled
+
+
+def with_focal(K: FloatArray, factor: float) -> FloatArray:
+    """K of a lens with a longer focal length; the principal point stays."""
+    changed = K.copy()
+    changed[[0, 1], [0, 1]] *= factor
+    return changed
+
+
+def swapped(K: FloatArray) -> FloatArray:
+    """K with x and y exchanged."""
+    order = [1, 0, 2]
+    exchanged: FloatArray = K[order][:, order]
+    return exchanged
+
+
+def with_K(right: Mapping[int, FloatArray | None]) -> Callable[[int, Frame], Frame]:
+    """A change of frames, by position, to the K that is right; None leaves one alone."""
+
+    def change(position: int, frame: Frame) -> Frame:
+        K = right.get(position)
+        return frame if K is None else replace(frame, K=K)
+
+    return change

@@ -1,0 +1,83 @@
+"""Hypotheses about the cameras of a whole capture, and what they make of its matches."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from deltas_geom import PosedViews
+from deltas_geom.diagnosis.evidence import Evidence, residuals
+from deltas_geom.diagnosis.trials import level
+from deltas_nets.check.finding import Finding
+
+__all__ = ["ENOUGH", "Suspect", "Tried", "rounded", "searched", "tried"]
+
+ENOUGH = 2.0
+"""px at the size that frames are looked at (about 400 wide): cameras that fit are below."""
+COMMON = (*(1 / n for n in (1.1, 1.2, 1.25, 1.5, 2, 3, 4)), 1.1, 1.2, 1.25, 4 / 3, 1.5, 2.0, 3.0)
+"""Factors that people resize images by."""
+_LEFT = 0.5  # of the residuals, at most, where a hypothesis explains them
+_LEAST_GAIN = 0.3  # px
+
+
+class Tried(NamedTuple):
+    """A hypothesis, on the pairs of frames that it can be tried on.
+
+    Attributes:
+        given: px, as the capture has it.
+        after: px, with the cure.
+    """
+
+    given: float
+    after: float
+
+    @property
+    def explains(self) -> bool:
+        """Whether so little is left that it is no accident."""
+        gain = self.given - self.after
+        return gain > _LEAST_GAIN and self.after <= min(_LEFT * self.given, 2 * ENOUGH)
+
+    @property
+    def in_words(self) -> str:
+        """The figures."""
+        return f"matches are {self.given:.3g} px off as given, {self.after:.2g} px with the cure"
+
+
+class Suspect(NamedTuple):
+    """A hypothesis, before it is known whether another explains more.
+
+    Attributes:
+        tried: what it makes of residuals.
+        finding: what is said if it is the one.
+    """
+
+    tried: Tried
+    finding: Finding
+
+
+def tried(evidence: Evidence, given: Tensor, views: PosedViews) -> Tried:
+    """Try cameras on pairs whose residuals ``(P)`` are known as given."""
+    return Tried(level(given), level(residuals(evidence, *views)))
+
+
+def searched(cost: Callable[[float], float], low: float = 0.4, high: float = 2.6) -> float:
+    """The factor of least cost, to 0.05 %; a grid first, as costs have many valleys."""
+    grid = np.exp(np.linspace(np.log(low), np.log(high), 31))
+    costs = [cost(float(factor)) for factor in grid]
+    best = int(np.argmin(costs))
+    center, width, least = float(grid[best]), float(np.log(grid[1] / grid[0])), costs[best]
+    while width > 5e-4:
+        width *= 0.5
+        for factor in (center * np.exp(-width), center * np.exp(width)):
+            found = cost(float(factor))
+            if found < least:
+                center, least = float(factor), found
+    return center
+
+
+def rounded(factor: float, cost: Callable[[float], float]) -> float:
+    """A factor that people resize by, where that is next to the best and about as good."""
+    near = min(COMMON, key=lambda common: abs(np.log(common / factor)))
+    good = cost(near) <= 1.15 * cost(factor) + 0.05
+    return near if abs(np.log(near / factor)) < 0.02 and good else factor

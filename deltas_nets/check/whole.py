@@ -1,0 +1,90 @@
+"""What `diagnose` says of all cameras of a capture, as a finding."""
+
+from typing import NamedTuple
+
+import torch
+
+from deltas_geom import diagnose
+from deltas_geom.diagnosis.causes import Cause
+from deltas_geom.diagnosis.hypotheses import MENDS
+from deltas_geom.diagnosis.results import Diagnosis
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.check.finding import Fault, Finding, Mend
+from deltas_nets.check.matched import Matched
+from deltas_nets.check.mending import changing_frames, changing_poses
+from deltas_nets.check.rewrite import with_K
+from deltas_nets.check.trying import ENOUGH, Suspect, Tried
+
+__all__ = ["diagnosed", "of_all_cameras"]
+
+
+class _Known(NamedTuple):
+    """How a cause of `diagnose` is said of a capture.
+
+    Attributes:
+        fault: what.
+        cure: in words of files.
+    """
+
+    fault: Fault
+    cure: str
+
+
+KNOWN = {
+    Cause.POSES_INVERTED: _Known(
+        Fault.POSES_INVERTED, "invert each pose (or tell the reader that it is world-to-camera)"
+    ),
+    Cause.OPENGL_AXES: _Known(
+        Fault.OPENGL_AXES, "negate the second and third column of each camera-to-world matrix"
+    ),
+    Cause.OPENGL_WORLD_FROM_CAM: _Known(
+        Fault.POSES_INVERTED,
+        "invert each pose, then negate the second and third column of camera-to-world "
+        "(poses are inverted, with OpenGL's axes)",
+    ),
+    Cause.ROTATIONS_TRANSPOSED: _Known(
+        Fault.ROTATIONS_TRANSPOSED, "transpose the rotation of each pose"
+    ),
+    Cause.CENTERS_AS_TRANSLATIONS: _Known(
+        Fault.CENTERS_AS_TRANSLATIONS, "write t = -R C, C being what stands there now"
+    ),
+    Cause.K_TRANSPOSED: _Known(Fault.K_TRANSPOSED, "transpose K: fx 0 cx, 0 fy cy, 0 0 1"),
+}
+"""Causes of all cameras that need no search."""
+
+
+def diagnosed(capture: Capture, matched: Matched) -> Diagnosis:
+    """What `diagnose` says of the matches."""
+    return diagnose(
+        matched.views(capture.frames), matched.pixels, mask=matched.seen, threshold=ENOUGH
+    )
+
+
+def of_all_cameras(diagnosis: Diagnosis) -> Suspect | None:
+    """The suspect that a diagnosis names, where that concerns all cameras."""
+    known = KNOWN.get(diagnosis.cause)
+    if known is None or diagnosis.cameras:
+        return None
+    found = Tried(diagnosis.residual_as_given, diagnosis.residual_if_mended)
+    finding = Finding(known.fault, found.in_words, (), known.cure, "error", _mend(diagnosis.cause))
+    return Suspect(found, finding)
+
+
+def _mend(cause: Cause) -> Mend:
+    change = MENDS[cause]
+    if cause is Cause.K_TRANSPOSED:
+
+        def transposing(capture: Capture) -> Capture:
+            right = {index: K.T.copy() for index, K in enumerate(capture.frames.K)}
+            return changing_frames(with_K(right))(capture)
+
+        return transposing
+
+    def poses(given: FloatArray) -> FloatArray:
+        tensor = torch.from_numpy(given)
+        K = torch.eye(3, dtype=torch.float64).expand(len(tensor), 3, 3)
+        mended: FloatArray = change(K, tensor)[1].numpy()
+        return mended
+
+    return changing_poses(poses)

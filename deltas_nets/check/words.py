@@ -1,0 +1,56 @@
+"""The report of a check, for people."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import wrap
+
+from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.check.finding import Finding
+from deltas_nets.check.verdict import Checked
+
+__all__ = ["report_lines"]
+
+_WIDTH = 96
+
+
+def report_lines(checked: Checked, capture: Path) -> Iterator[str]:
+    """Lines to print: what is wrong, how that is known, what to do, and what was looked at."""
+    for number, finding in enumerate(checked.findings, start=1):
+        yield f"{number}. {finding.severity}: {finding.cause.value}"
+        yield from _part("evidence", finding.evidence)
+        if finding.frames:
+            yield from _part("frames", ids_in_words(finding.frames, 20))
+        yield from _part("cure", cure_in_words(finding, capture))
+        yield ""
+    yield f"verdict: {checked.verdict}"
+    yield figures_in_words(checked)
+
+
+def cure_in_words(finding: Finding, capture: Path) -> str:
+    """The cure, and the command that does it where there is one."""
+    if finding.mend is None:
+        return finding.cure
+    return f"{finding.cure}; or: deltas check {capture} --mend OUT"
+
+
+def figures_in_words(checked: Checked) -> str:
+    """What was looked at, in a line."""
+    found = checked.figures
+    frames = f"{found.looked_at} of {found.frames} frames matched"
+    if not found.pairs:
+        return f"{frames}, {found.seconds:.1f} s"
+    return (
+        f"{frames}: {found.matches} matches in {found.pairs} pairs, median residual "
+        f"{found.residual:.2g} px, {100 * found.fit:.0f} % of the pairs fit, {found.seconds:.1f} s"
+    )
+
+
+def _part(name: str, text: str) -> list[str]:
+    return wrap(
+        text,
+        _WIDTH,
+        initial_indent=f"   {name + ':':10}",
+        subsequent_indent=" " * 13,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

@@ -1,0 +1,82 @@
+"""The command `deltas check`."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deltas_nets.commands.command import Command
+from deltas_nets.commands.flags import Flag
+
+
+@dataclass(frozen=True)
+class Check(Command):
+    """Tell what is wrong with a capture, how that is known, and what mends it.
+
+    Looks at files, cameras, images and sensor depth, and matches frames spread over the capture:
+    poses that are inverted, have other axes or belong to other frames, intrinsics of other images,
+    frames that disagree with all others, and more. Nothing is written unless asked for. The exit
+    status is 0 where nothing is found, 1 where something is, and 2 where nothing could be checked.
+
+    Example: deltas check my_capture --mend mended_capture
+    """
+
+    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
+        kw_only=True
+    )
+    """A folder or file that deltas depth would take."""
+    intrinsics: Annotated[str | None, tyro.conf.arg(metavar='"FX FY CX CY ..."')] = None
+    """Of all images, whatever the capture says; as deltas depth takes them."""
+    mend: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the capture with everything mended that can be, to a new folder in our own format whose
+    images are links."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write everything to this file."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, mps."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from deltas_nets.captures.camera_words import Intrinsics
+        from deltas_nets.captures.opening import open_capture
+        from deltas_nets.captures.saving import save_capture
+        from deltas_nets.check.matched import GROUPS
+        from deltas_nets.check.refused import checked_refusal
+        from deltas_nets.check.verdict import check_capture
+        from deltas_nets.check.words import report_lines
+        from deltas_nets.commands.flags import usable_device
+        from deltas_nets.errors import UserError
+        from deltas_nets.outputs.atomic_files import check_writable, write_json
+        from deltas_nets.terminal import progress, warn
+        from deltas_nets.weights_file import load_model
+
+        if self.json is not None:
+            check_writable(self.json.parent)
+        device = usable_device(self.device)
+        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
+        capture = None
+        try:
+            capture = open_capture(self.capture, intrinsics=stated)
+        except UserError as error:
+            checked = checked_refusal(self.capture, error)
+        else:
+            for doubt in capture.doubts:
+                warn(doubt)
+            with progress("matching", GROUPS) as report:
+                checked = check_capture(
+                    capture, load_model("deltas-small", device=device), report=report
+                )
+        for line in report_lines(checked, self.capture):
+            print(line)
+        if self.json is not None:
+            write_json(self.json, checked.in_json())
+        if self.mend is not None and capture is not None:
+            save_capture(checked.mended(capture), self.mend, placing="link")
+            print(f"mended: {self.mend}")
+        if checked.findings:
+            sys.stdout.flush()
+            sys.exit(1)
