@@ -12,6 +12,7 @@ import tyro
 
 from deltas_nets import __version__
 from deltas_nets.commands.command import Command
+from deltas_nets.commands.words import first_page, sentence
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import silent_without_reader, stopped_like_ctrl_c
 
@@ -26,7 +27,10 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
         if list(arguments) == ["--version"]:
             print(f"deltas-depth {__version__}")
             return
-        command = parse(list(arguments) or ["--help"], commands)
+        if not arguments or list(arguments) in (["--help"], ["-h"]):
+            print(first_page(commands, __version__))
+            return
+        command = parse(list(arguments), commands)
         try:
             with stopped_like_ctrl_c():
                 command.run()
@@ -57,7 +61,9 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
         if not stopped.code:
             sys.stdout.flush()  # the help, which a reader may have had enough of
             raise
-        what = shorten(_in_words(said.getvalue()), 200, placeholder=" ...")
+        names = {command.__name__.lower(): command for command in commands}
+        what = sentence(_in_words(said.getvalue()), names)
+        what = shorten(what, 200, placeholder=" ...")
         _fail(UserError(what, "command line", _help_of(arguments, commands)))
     return command
 
@@ -77,7 +83,7 @@ def _in_words(box: str) -> str:
     said = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
     # An option that may be left out: tyro tells what went wrong with each of its types.
     said = re.sub(
-        r"no type matching \{None\}\|\{(.+?)\} could be instantiated from (\[.*?\])\."
+        r"no type matching \{None\}\|\{?(.+?)\}? could be instantiated from (\[.*?\])\."
         r" Got errors: [^;]*",
         r"\1 expected, got \2",
         said,
