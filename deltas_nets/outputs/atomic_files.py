@@ -84,7 +84,7 @@ def check_writable(out: Path) -> None:
         UserError: it is a file, or the system refuses.
     """
     if out.exists() and not out.is_dir():
-        raise UserError("this is a file, not a folder", out, "name a folder with --out")
+        raise UserError("this is a file, not a folder", out, "name another place")
     parents = (out, *out.absolute().parents)
     nearest = next(folder for folder in parents if folder.exists())
     try:
