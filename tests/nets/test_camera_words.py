@@ -49,6 +49,7 @@ REFUSED = {
     "cameras.xml": (b'<?xml?><document version="1"><chunk label="a">', "Metashape", "Export"),
     "poses.csv": (b"#name,x,y,alt,heading\n", "RealityCapture", "COLMAP"),
     "bundle.out": (b"# Bundle file v0.3\n", "Bundler", "colmap"),
+    "sfm_data.bin": (b"", "OpenMVG", "sfm_data.json"),
     "walk.mov": (b"", "video", "ffmpeg"),
     "scan.zip": (b"PK", "archive", "unpack"),
     "scan.r3d": (b"PK", "Record3D", "EXR"),

@@ -48,13 +48,13 @@ class _Pose(NamedTuple):
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has kapture's tables."""
-    sensors = path / "sensors"
-    return (sensors / "sensors.txt").is_file() or (sensors / "records_camera.txt").is_file()
+    """Whether the folder, or the mapping part of it, has kapture's tables."""
+    return _folder(path) is not None
 
 
 def read(path: Path) -> Capture:
     """Read cameras and poses; see `deltas_nets.captures.opening.Reader` for the contract."""
+    path = _folder(path) or path
     folder = path / "sensors"
     sensors = _sensors(folder / "sensors.txt")
     poses = _poses(folder / "trajectories.txt")
@@ -71,7 +71,7 @@ def read(path: Path) -> Capture:
             what = (
                 f"line {number} is of the sensor {device[:40]!r}, which is no camera that is read"
             )
-            raise UserError(what, records, "add it to sensors.txt with a model of COLMAP's")
+            raise UserError(what, records, "calibrate it: sensors.txt takes models of COLMAP's")
         matrix = _cam_from_world(stamp, device, poses, rigs)
         if matrix is None:
             what = f"frame {id} has no pose"
@@ -105,6 +105,14 @@ def read(path: Path) -> Capture:
     )
 
 
+def _folder(path: Path) -> Path | None:
+    for folder in (path, path / "mapping"):
+        tables = folder / "sensors"
+        if (tables / "sensors.txt").is_file() or (tables / "records_camera.txt").is_file():
+            return folder
+    return None
+
+
 def _rows(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
     """Numbers and values of the lines."""
     text = read_text(path, name="table", remedy=_REMEDY)
@@ -134,8 +142,7 @@ def _sensors(path: Path) -> Mapping[str, _Sensor]:
             continue
         model = words[3].upper() if len(words) > 3 else ""
         if model not in MODELS or model == "EQUIRECTANGULAR":
-            what = f"line {line} has a camera of the model {model[:40]!r}, which is not read"
-            raise UserError(what, path, "calibrate the camera, or convert it to one of COLMAP's")
+            continue
         numbers = _numbers(words[4:], line, path)
         focals, bends = MODELS[model].focals, len(MODELS[model].coefficients)
         if len(numbers) != 4 + focals + bends:

@@ -20,7 +20,7 @@ def numbered_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> d
     for path in folder.iterdir():
         name = path.name.lower()
         suffix = next((suffix for suffix in suffixes if name.endswith(suffix)), None)
-        if suffix is None or not name.startswith(prefix):
+        if suffix is None or not name.startswith(prefix) or not path.is_file():
             continue
         digits = name[len(prefix) : len(name) - len(suffix)]
         if digits.isascii() and digits.isdigit() and len(digits) < 19:

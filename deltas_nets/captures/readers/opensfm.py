@@ -63,7 +63,7 @@ def read(path: Path) -> Capture:
     shots = best.inner("shots")
     names = sorted(shots.values)
     ids = dict(zip(names, frame_ids(names, file), strict=True))
-    finder = FileFinder(folder, (folder / "images",))
+    finder = FileFinder(folder, (folder / "images", folder.parent / "images"))
     cameras = _cameras(best)
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
@@ -113,11 +113,11 @@ def read(path: Path) -> Capture:
 
 def _file(path: Path) -> Path | None:
     """The reconstruction of a folder; older programs and examples call it a little differently."""
-    if not path.is_dir():
-        return None
-    found = path.glob("reconstruction*.json")
+    # OpenDroneMap keeps OpenSfM's folder inside of its own.
+    folders = [folder for folder in (path, path / "opensfm") if folder.is_dir()]
+    found = (file for folder in folders for file in folder.glob("reconstruction*.json"))
     # The shortest name first: reconstruction.json before reconstruction.meshed.json.
-    return min(found, key=lambda file: (len(file.name), file.name), default=None)
+    return min(found, key=lambda file: (len(file.name), file), default=None)
 
 
 def _cameras(

@@ -29,14 +29,11 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Capture:
     """Read key frames; see `deltas_nets.captures.opening.Reader` for the contract."""
-    folder = _keyframes(path)
-    if folder is None:
+    both = _keyframes(path)
+    if both is None:
         raise UserError("there are no cameras in keyframes", path, _REMEDY)
-    cameras, images = next(
-        (folder / cameras, folder / images)
-        for cameras, images in _KINDS
-        if (folder / cameras).is_dir()
-    )
+    cameras, images = both
+    folder = cameras.parent
     doubts = []
     if cameras.name == "cameras":
         doubts.append(f"poses are as tracked, not optimised (no corrected_cameras), {folder}")
@@ -44,8 +41,6 @@ def read(path: Path) -> Capture:
     lost: dict[str, Lost] = {}
     missing = []
     files = sorted(file for file in cameras.iterdir() if file.suffix.lower() == ".json")
-    if not files:
-        raise UserError("there is no camera", cameras, _REMEDY)
     for file in files:
         id = file.stem
         image = next(
@@ -81,11 +76,13 @@ def read(path: Path) -> Capture:
     return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "Polycam", metric=True)
 
 
-def _keyframes(path: Path) -> Path | None:
+def _keyframes(path: Path) -> tuple[Path, Path] | None:
+    """The folders of cameras and of images, optimised ones first."""
     for folder in (path / "keyframes", path):
         for cameras, images in _KINDS:
-            if (folder / cameras).is_dir() and (folder / images).is_dir():
-                return folder if _holds_json(folder / cameras) else None
+            both = folder / cameras, folder / images
+            if both[0].is_dir() and both[1].is_dir() and _holds_json(both[0]):
+                return both
     return None
 
 

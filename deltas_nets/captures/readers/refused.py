@@ -48,6 +48,11 @@ _MODELS: tuple[Rule, ...] = (
         "in RealityCapture export the registration as COLMAP text, and name the folder it writes",
     ),
     (
+        "a binary scene of OpenMVG",
+        lambda path, head: path.name.startswith("sfm_data") and path.suffix == ".bin",
+        "write it as text: openMVG_main_ConvertSfM_DataFormat -i sfm_data.bin -o sfm_data.json",
+    ),
+    (
         "a Bundler model",
         lambda path, head: path.suffix.lower() == ".out" and head.startswith(b"# Bundle file"),
         "it has no principal points and no sizes: run COLMAP on its photos, " + _COLMAP,

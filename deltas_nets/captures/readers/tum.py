@@ -62,8 +62,8 @@ class _Trajectory(NamedTuple):
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has the two lists."""
-    return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
+    """Whether the folder has the list of images."""
+    return (path / "rgb.txt").is_file()
 
 
 def read(path: Path) -> Capture:
@@ -122,13 +122,13 @@ def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
 
 def _camera(path: Path, image_size: tuple[int, int]) -> tuple[Intrinsics, str]:
     """The camera of a folder that states it, and a word on where from."""
-    for name in ("intrinsics.txt", "camera.txt"):
+    for name in ("intrinsics.txt", "camera.txt", "calibration.txt"):
         if (path / name).is_file():
             remedy = "write fx fy cx cy, and k1 k2 p1 p2 k3 of a lens, or pass --intrinsics"
             text = read_text(path / name, name="intrinsics", remedy=remedy)
             lines = (line.partition("#")[0] for line in text.splitlines())
             return Intrinsics.parse(" ".join(lines), path / name), f", {name}"
-    heads = (_head(path / name) for name in ("rgb.txt", "groundtruth.txt"))
+    heads = [_head(path / name) for name in ("rgb.txt", "groundtruth.txt")]
     for words in (path.resolve().name, *heads):
         camera = named_camera(words)
         if camera is None:
@@ -177,7 +177,7 @@ def _is_there(folder: Path, name: str, known: dict[str, frozenset[str]]) -> bool
             known[above] = frozenset(os.listdir(folder / above) if inside else ())
         except OSError:
             known[above] = frozenset()
-    return file in known[above]
+    return file in known[above] and (folder / name).is_file()
 
 
 def _read_trajectory(path: Path) -> _Trajectory:
