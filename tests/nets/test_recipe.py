@@ -10,14 +10,13 @@ import pytest
 import torch
 from run_command import Run, assert_one_line, runner
 from run_fit import CONFIG as CONFIG_OF_FOUR
-from run_fit import logged
+from run_fit import HELD_OUT, logged
 from safetensors.torch import save_file
 from torch import Tensor
 
 from deltas_nets.config import to_dict
 from deltas_nets.config.recipes import FEWEST_ROOMS, RECIPES, Part, Recipe
 from deltas_nets.errors import UserError
-from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train import recipe as recipe_module
 from deltas_nets.train.checkpoint import load_config
@@ -39,9 +38,8 @@ FIRST, SECOND = (part.name for part in SMALL.parts)
 
 @pytest.fixture(scope="module", autouse=True)
 def _small_validation() -> Iterator[None]:
-    few = Rooms(1, num_views=2, image_size=(48, 64))
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(fit_module, "validation_rooms", lambda: few)
+        monkeypatch.setattr(fit_module, "validation_rooms", lambda: HELD_OUT)
         yield
 
 
