@@ -83,8 +83,10 @@ def others_of(found: list[Tensor], plain: list[Tensor]) -> list[Tensor]:
 
 
 @EACH
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf], ids=str)
-def test_what_is_not_finite_is_answered_finitely_and_alone(name: str, value: float) -> None:
+@pytest.mark.parametrize("turn", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
+def test_what_is_not_finite_is_answered_finitely_and_alone(name: str, turn: int) -> None:
+    """A value a place, and each value at each place at night."""
+    values = (torch.nan, torch.inf, -torch.inf)
     operation, given = OPERATIONS[name], chosen(OPERATIONS[name], inputs_in(torch.float64))
     plain = tensors_of(operation(**given))
     for spoilt in real_names(given):
@@ -93,12 +95,13 @@ def test_what_is_not_finite_is_answered_finitely_and_alone(name: str, value: flo
         inputs = followed(good)
         wanted = others_of(tensors_of(operation(**inputs)), plain)
         wanted_gradients = gradients_of(wanted, inputs)
-        for place in (0, size // 2, size - 1):
+        for number, place in enumerate((0, size // 2, size - 1)):
+            value = values[(number + turn) % 3]
             bad = good[spoilt].clone(memory_format=torch.contiguous_format)
             bad[1].view(-1)[place] = value
             inputs = followed(good | {spoilt: bad})
             results = tensors_of(operation(**inputs))
-            where = f"{spoilt}[{place}]"
+            where = f"{spoilt}[{place}] = {value}"
             found = others_of(results, plain)
             for ours, theirs in zip(found, wanted, strict=True):
                 assert_close(ours, theirs, rtol=1e-9, atol=1e-9, msg=lambda m, w=where: f"{w}: {m}")
