@@ -138,9 +138,11 @@ def hostile(
 
 
 def batches(seed: int, dtype: torch.dtype, count: int = 40, *, finite: bool) -> Iterator[Batch]:
-    for name in NAMES:
-        for size in ((3, 3, count), (2, 2, count), (1, 5, count)):
-            yield hostile(name, seed, dtype, size=size, finite=finite)
+    """Of every name one, of rigs, pairs and five views in turn."""
+    sizes = ((3, 3, count), (2, 2, count), (1, 5, count))
+    for number, name in enumerate(NAMES):
+        size = sizes[(number + dtype.itemsize) % 3]
+        yield hostile(name, seed, dtype, size=size, finite=finite)
 
 
 def rays_of(batch: Batch) -> Tensor:
