@@ -1,7 +1,6 @@
-"""Functions of an angle, smooth where it is 0, none of which starts threads for few numbers.
+"""Functions of the square of an angle: smooth where it is 0, and made of sums and products.
 
-Torch's sine, cosine, tangent, arc tangent and root start some from 2048 numbers on; its sinc, arc
-tangent of two and reciprocal root do not.
+Torch's sine, cosine and tangent start threads from 2048 numbers on, and its sinc takes 30 ns.
 """
 
 import math
@@ -13,7 +12,9 @@ from torch import Tensor
 _SMALL = 1e-3
 """Squared angles below which five terms of a series are exact in float64."""
 _ARC_TANGENT = [1 / 9, -1 / 7, 1 / 5, -1 / 3, 1.0]
-_TANGENT = [62 / 2835, 17 / 315, 2 / 15, 1 / 3, 1.0]
+# Of half of an angle up to pi: the next term is below rounding.
+_SINE = [(-1) ** k / math.factorial(2 * k + 1) for k in range(11, -1, -1)]
+_COSINE = [(-1) ** k / math.factorial(2 * k) for k in range(12, -1, -1)]
 
 
 def root(squared: Tensor) -> Tensor:
@@ -21,24 +22,17 @@ def root(squared: Tensor) -> Tensor:
     return squared * squared.rsqrt()
 
 
-def sine_ratio(angle: Tensor) -> Tensor:
-    """sin(a) / a."""
-    return torch.sinc(angle / math.pi)
-
-
-def cosine(angle: Tensor) -> Tensor:
-    """cos(a), to rounding of 1."""
-    half = angle / 2
-    sine = half * sine_ratio(half)
-    return torch.addcmul(angle.new_ones(()), sine, sine, value=-2)
+def sine_ratio_and_cosine(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """sin(a) / a and cos(a) of the square of an angle up to pi, to rounding of 1."""
+    quarter = squared / 4
+    sine, cosine = _series(_SINE, quarter), _series(_COSINE, quarter)
+    return sine * cosine, 1 - 2 * quarter * sine * sine
 
 
 def tangent_ratio(squared: Tensor) -> Tensor:
     """tan(a) / a of the square of an angle, which is below a right one."""
-    small = squared < _SMALL
-    angle = root(torch.where(small, 1.0, squared))
-    ratio = sine_ratio(angle) / cosine(angle)
-    return torch.where(small, _series(_TANGENT, squared), ratio)
+    sine, cosine = sine_ratio_and_cosine(squared)
+    return sine / cosine
 
 
 def angle_ratio(squared: Tensor, z: Tensor) -> Tensor:
@@ -56,7 +50,7 @@ def angle_ratio(squared: Tensor, z: Tensor) -> Tensor:
 
 
 def _series(coefficients: Sequence[float], x: Tensor) -> Tensor:
-    value = torch.full_like(x, coefficients[0])
-    for coefficient in coefficients[1:]:
-        value = value * x + coefficient
+    value = coefficients[0] * x + coefficients[1]
+    for coefficient in coefficients[2:]:
+        value = torch.addcmul(x.new_full((), coefficient), value, x)
     return value

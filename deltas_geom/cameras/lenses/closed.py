@@ -12,12 +12,14 @@ from torch import Tensor
 
 from deltas_geom.cameras.lenses.angles import (
     angle_ratio,
-    cosine,
     root,
-    sine_ratio,
+    sine_ratio_and_cosine,
     tangent_ratio,
 )
 from deltas_geom.numerics.arithmetic import only, unless_all
+
+_TURN = 5e-5
+"""Of the derivative at the axis: where a division has less, pixels are lost to rounding."""
 
 Coefficients = Sequence[Tensor]  # each (*B, 1)
 Seen = tuple[Tensor, Tensor, Tensor]
@@ -69,7 +71,7 @@ def division_pixels(coefficients: Coefficients, x: Tensor, y: Tensor, z: Tensor)
     k = coefficients[0]
     squared = torch.addcmul(x * x, y, y)
     under = torch.addcmul(z * z, k, squared, value=-4)
-    seen = (under > 1e-20 * z * z) & ((z > 0) | ((k < 0) & (squared > 0)))
+    seen = (under > _TURN**2 * z * z) & ((z > 0) | ((k < 0) & (squared > 0)))
     ahead = z > 0
     distance = root(torch.where(seen, under, 1.0))
     # Two forms of one root of a quadratic, of which each cancels where the other is taken.
@@ -83,7 +85,7 @@ def division_pixels(coefficients: Coefficients, x: Tensor, y: Tensor, z: Tensor)
 def division_rays(coefficients: Coefficients, u: Tensor, v: Tensor) -> Direction:
     """Before 1 / sqrt(k) where k is positive; anywhere else."""
     depth = torch.addcmul(u * u, v, v) * coefficients[0]
-    return u, v, 1 + depth, depth < 1
+    return u, v, 1 + depth, 1 - depth > _TURN * (1 + depth)
 
 
 def eucm_pixels(coefficients: Coefficients, x: Tensor, y: Tensor, z: Tensor) -> Seen:
@@ -128,9 +130,11 @@ def panorama_pixels(_: Coefficients, x: Tensor, y: Tensor, z: Tensor) -> Seen:
 
 def panorama_rays(_: Coefficients, u: Tensor, v: Tensor) -> Direction:
     """Of longitudes within half a turn and latitudes within a quarter."""
-    across = cosine(v)
     seen = (u.abs() <= math.pi) & (v.abs() <= math.pi / 2)
-    return across * u * sine_ratio(u), v * sine_ratio(v), across * cosine(u), seen
+    known = unless_all(seen)
+    u, v = only(u, known), only(v, known)
+    (side, ahead), (down, across) = sine_ratio_and_cosine(u * u), sine_ratio_and_cosine(v * v)
+    return across * u * side, v * down, across * ahead, seen
 
 
 def _below(value: Tensor, limit: float) -> tuple[Tensor, Tensor]:

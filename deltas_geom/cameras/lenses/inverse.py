@@ -9,10 +9,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.lenses.terms import Pair, Terms, distort_and_derive, gain
+from deltas_geom.cameras.lenses.angles import root
+from deltas_geom.cameras.lenses.terms import (
+    Pair,
+    Terms,
+    distort_and_derive,
+    gain,
+    image_radius,
+)
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 
-_PLAIN, _POLISH, _BRACKETED = 4, 3, 48
+_PLAIN, _POLISH, _BRACKETED, _CAREFUL = 4, 3, 60, 20
 _FOLLOWED = 2
 """Steps with gradient, of which each doubles the order to which derivatives are right."""
 
@@ -40,19 +47,20 @@ def undistort(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted
         v: ``(*B, N)``.
         within: ``(*B, 1)`` from :func:`one_to_one_within`.
     """
-    first = _solve(terms, u, v, within, _plain_scale(terms, u, v))
+    first = _solve(terms, u, v, within, _plain_scale(terms, u, v), _POLISH)
     if surely_all(first.found):
         return first
+    # Beyond what the whole disc goes to there is no point to look for.
+    lost = ~first.found & (torch.addcmul(u * u, v, v) <= image_radius(terms, within).square())
     if not values_at_hand(first.found):
-        again = _solve(terms, u, v, within, _bracketed_scale(terms, u, v, within))
+        again = _solve_safely(terms, u, v, within)
         return _either(first, again)
     # Not again what is found: what is not may be few.
-    lost = ~first.found
     few_terms = Terms(*(tuple(c.expand(lost.shape)[lost] for c in part) for part in terms))
-    few = u.expand(lost.shape)[lost], v.expand(lost.shape)[lost], within.expand(lost.shape)[lost]
-    again = _solve(few_terms, *few, _bracketed_scale(few_terms, *few))
+    few = (each.expand(lost.shape)[lost] for each in (u, v, within))
+    again = _solve_safely(few_terms, *few)
     # In place: all three are our own.
-    x, y, found = (tensor.contiguous() for tensor in first)
+    x, y, found = (each.expand(lost.shape).contiguous() for each in first)
     x[lost], y[lost], found[lost] = again
     return Undistorted(x, y, found)
 
@@ -79,9 +87,13 @@ def _plain_scale(terms: Terms, u: Tensor, v: Tensor) -> Tensor:
     """q of which q (u, v) is nearly the point, the radial terms alone being looked at."""
     s = torch.addcmul(u * u, v, v)
     q = torch.ones_like(s)
+    # Where other terms are to come they move the point by more than this.
+    enough = 1e-4 if terms.only_radial else 3e-2
     for _ in range(_PLAIN):
         _, step = _scale_step(terms, q, s)
         q = q - step
+        if surely_all(step.abs() < enough):
+            break
     return q
 
 
@@ -99,28 +111,69 @@ def _bracketed_scale(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Tens
     low = torch.zeros_like(s)
     high = (within * s.clamp(min=torch.finfo(s.dtype).tiny).rsqrt()).clamp(max=1e9)
     q = torch.minimum(torch.ones_like(s), high / 2)
+    last, tiny = high, 64 * torch.finfo(s.dtype).eps
     for _ in range(_BRACKETED):
         excess, step = _scale_step(terms, q, s)
         above = excess > 0
         low, high = torch.where(above, low, q), torch.where(above, q, high)
         newton = q - step
-        inside = (newton > low) & (newton < high)
-        q = torch.where(inside, newton, (low + high) / 2)
+        size = step.abs()
+        # Not where steps hardly shrink, as of a power high above its root; but at the root.
+        shrinks = (2 * size < last) | (size <= tiny * q)
+        good = (newton >= low) & (newton <= high) & shrinks
+        following = torch.where(good, newton, (low + high) / 2)
+        last, q = (following - q).abs(), following
     return q
 
 
-def _solve(terms: Terms, u: Tensor, v: Tensor, within: Tensor, q: Tensor) -> Undistorted:
+def _solve(
+    terms: Terms, u: Tensor, v: Tensor, within: Tensor, q: Tensor, steps: int
+) -> Undistorted:
     """Points near q (u, v), polished on the plane."""
+    if terms.only_radial:
+        s = torch.addcmul(u * u, v, v)
+        _, step = _scale_step(terms, q, s)
+        q = q - step
+        t = q * q * s
+        near = step * step * s <= _close(t)
+        return Undistorted(q * u, q * v, near & (t < within * within))
     x, y = q * u, q * v
     dx = dy = x
-    for _ in range(1 if terms.only_radial else _POLISH):
+    for _ in range(steps):
         dx, dy = _newton(terms, x, y, u, v)
         x, y = x - dx, y - dy
+    return _judged(x, y, dx, dy, within)
+
+
+def _solve_safely(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted:
+    """The same from a bracket, by steps that stay in the disc."""
+    q = _bracketed_scale(terms, u, v, within)
+    if terms.only_radial:
+        return _solve(terms, u, v, within, q, 1)
+    x, y = q * u, q * v
+    dx = dy = x
+    for _ in range(_CAREFUL):
+        dx, dy = _newton(terms, x, y, u, v)
+        t = torch.addcmul(x * x, y, y)
+        x, y = x - dx, y - dy
+        new = torch.addcmul(x * x, y, y)
+        # Half of the way to the border, where a step would leave.
+        halfway = (root(t) + within) / 2 * new.rsqrt()
+        scale = torch.where(new < within * within, 1.0, halfway)
+        x, y = x * scale, y * scale
+    return _judged(x, y, dx, dy, within)
+
+
+def _judged(x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, within: Tensor) -> Undistorted:
+    """Which points solve the equations after a last step, and within the disc."""
     t = torch.addcmul(x * x, y, y)
-    # What is left after a step is of the size of its square.
-    small = 16 * torch.finfo(x.dtype).eps
-    near = torch.addcmul(dx * dx, dy, dy) <= small * t.clamp(min=1)
+    near = torch.addcmul(dx * dx, dy, dy) <= _close(t)
     return Undistorted(x, y, near & (t < within * within))
+
+
+def _close(t: Tensor) -> Tensor:
+    """The square of a last step: what is left after a step is of the size of that."""
+    return 16 * torch.finfo(t.dtype).eps * t.clamp(min=1)
 
 
 def _newton(terms: Terms, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Pair:

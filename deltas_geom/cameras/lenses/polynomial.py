@@ -6,7 +6,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.lenses.angles import angle_ratio, cosine, root, sine_ratio
+from deltas_geom.cameras.lenses.angles import angle_ratio, sine_ratio_and_cosine
 from deltas_geom.cameras.lenses.closed import Coefficients, Direction, Seen, slopes
 from deltas_geom.cameras.lenses.inverse import follow, undistort
 from deltas_geom.cameras.lenses.terms import Terms, distort, one_to_one_within
@@ -131,11 +131,8 @@ def _angles(x: Tensor, y: Tensor, z: Tensor) -> Seen:
 
 
 def _from_angles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    squared = torch.addcmul(x * x, y, y)
-    off = squared > torch.finfo(squared.dtype).tiny
-    angle = only(root(torch.where(off, squared, 1.0)), off)
-    ratio = sine_ratio(angle)
-    return x * ratio, y * ratio, cosine(angle)
+    ratio, z = sine_ratio_and_cosine(torch.addcmul(x * x, y, y))
+    return x * ratio, y * ratio, z
 
 
 def _from_slopes(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:

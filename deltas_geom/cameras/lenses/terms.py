@@ -160,8 +160,22 @@ def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
     else:
         first = _first_root(steepness[1:]).sqrt()
     if terms.divided:
-        first = torch.minimum(first, _first_root(list(terms.divided)).sqrt())
+        # At a pole itself there is no number.
+        pole = _first_root(list(terms.divided)).sqrt() * (1 - 1e-9)
+        first = torch.minimum(first, pole)
     return first.clamp(max=limit)
+
+
+def image_radius(terms: Terms, within: Tensor) -> Tensor:
+    """A circle outside of which nothing of the disc ``within`` goes, ``(*B, 1)``."""
+    t = within * within
+    radius = within * gain(terms, t)[0]
+    if terms.tangential:
+        radius = radius + 3 * torch.hypot(*terms.tangential) * t
+    if terms.prism:
+        sx1, sy1, sx2, sy2 = terms.prism
+        radius = radius + torch.hypot(sx1, sy1) * t + torch.hypot(sx2, sy2) * t * t
+    return radius * (1 + 1e-9)
 
 
 def _product(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:

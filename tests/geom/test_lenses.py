@@ -1,0 +1,204 @@
+"""Lenses there and back: whatever the model, a ray is right or there is none."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from lens_cases import CASES, TURNING, Case, pixels_of, seen_from_the_axis
+from torch import Tensor
+from torch.testing import assert_close
+
+import deltas_geom as geom
+from deltas_geom import Lens
+from deltas_geom.testing.strategies import vectors
+
+ALL = CASES | TURNING
+EACH = pytest.mark.parametrize("name", ALL)
+SLOPES = {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_THIN_PRISM"}
+MODELS = pytest.mark.parametrize("model", CASES)
+
+
+def test_there_is_a_case_of_every_model() -> None:
+    assert set(CASES) == set(Lens.models())
+
+
+def test_names_and_counts_that_are_wrong_are_told_with_the_right_ones() -> None:
+    K = torch.eye(3)
+    with pytest.raises(ValueError, match="did you mean OPENCV_FISHEYE"):
+        Lens(K, torch.zeros(4), "OPENCV_FISHEY")
+    with pytest.raises(ValueError, match="OPENCV"):
+        Lens(K, torch.zeros(4), "xyz")
+    with pytest.raises(geom.ShapeError, match=r"OPENCV must be 4 \(k1 k2 p1 p2\), got 5"):
+        Lens(K, torch.zeros(5), "OPENCV")
+    with pytest.raises(geom.ShapeError, match=r"RADIAL must be 5 \(f cx cy k1 k2\), got 4"):
+        Lens.from_colmap("RADIAL", [1.0, 0, 0, 0])
+    with pytest.raises(geom.ShapeError, match="4, 5, 8, 12 or 14 coefficients, got"):
+        Lens.from_opencv(K, torch.zeros(6))
+    with pytest.raises(ValueError, match="tilt"):
+        Lens.from_opencv(K, torch.ones(14))
+    with pytest.raises(geom.ShapeError, match="K must have shape"):
+        Lens(torch.eye(4), torch.zeros(4), "OPENCV")
+    with pytest.raises(TypeError, match="coefficients must be"):
+        Lens(K, [0.0] * 4, "OPENCV")  # type: ignore[arg-type]
+
+
+def assert_there_and_back(case: Case, pixels: Tensor) -> Tensor:
+    """Returns which pixels were valid."""
+    lens = case.lens()
+    rays, valid = lens.unproject(pixels)
+    assert rays.isfinite().all() and (rays[~valid] == 0).all()
+    lengths = rays.norm(dim=-1)
+    assert_close(lengths, valid.double(), rtol=0, atol=1e-14)
+    again, seen = lens.project(rays)
+    assert again.isfinite().all() and (again[~seen] == 0).all()
+    assert float((seen != valid).double().mean()) < 1e-3 or len(pixels) < 1000
+    both = (seen & valid).unsqueeze(-1)
+    assert_close(torch.where(both, again, pixels), pixels, rtol=0, atol=1e-9)  # px
+    return valid
+
+
+@EACH
+def test_a_pixel_comes_back_or_is_masked(name: str) -> None:
+    case = ALL[name]
+    valid = assert_there_and_back(case, pixels_of(20000))
+    share = float(valid.double().mean())
+    assert abs(share - case.share) < 0.02 if name in TURNING else share == 1
+
+
+@pytest.mark.slow
+@EACH
+def test_a_million_pixels_come_back(name: str) -> None:
+    assert_there_and_back(ALL[name], pixels_of(1_000_000, seed=1))
+
+
+@EACH
+@given(places=vectors(6, within=1.0), size=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_a_point_comes_back_as_its_own_ray_or_is_masked(
+    name: str, places: Tensor, size: float
+) -> None:
+    lens = ALL[name].lens()
+    points = size * (places + torch.tensor([0, 0, 1.0]))
+    pixels, valid = lens.project(points)
+    rays, found = lens.unproject(pixels)
+    wanted = points / points.norm(dim=-1, keepdim=True).clamp(min=1e-300)
+    # Where it is found at all: close to the end of the domain pixels are dense.
+    both = (found & valid).unsqueeze(-1)
+    assert_close(torch.where(both, rays, wanted), wanted, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if ALL[name].model in SLOPES])
+def test_the_mask_is_the_domain_that_can_be_seen_from_the_axis(name: str) -> None:
+    case, pixels = ALL[name], pixels_of(4000)
+    found = case.lens().unproject(pixels).valid.numpy()
+    assert np.mean(found == seen_from_the_axis(case, pixels)) >= 0.999
+
+
+@MODELS
+def test_single_precision_is_as_good_as_its_pixels(model: str) -> None:
+    case, pixels = CASES[model], pixels_of(20000)
+    lens = case.lens(torch.float32)
+    single = pixels.float()
+    rays, valid = lens.unproject(single)
+    exact, known = lens.to(torch.float64).unproject(single.double())
+    assert rays.dtype == torch.float32 and torch.equal(valid, known)
+    assert_close(rays.double(), exact, rtol=0, atol=6e-8)
+    again = lens.project(rays).pixels
+    condition = 1 / exact[valid][:, 2].abs().clamp(min=0.05).min().item() ** 2
+    assert float((again - single)[valid].abs().max()) < 2e-4 * condition
+
+
+@MODELS
+def test_derivatives_are_those_of_differences(model: str) -> None:
+    case, pixels = CASES[model], pixels_of(5, seed=3)
+    lens = case.lens()
+    points = 2 * lens.unproject(pixels).rays
+    there = lambda K, c, x: Lens(K, c, model).project(x).pixels  # noqa: E731
+    back = lambda K, c, x: Lens(K, c, model).unproject(x).rays  # noqa: E731
+    for function, items in ((there, points), (back, pixels)):
+        given = [t.clone().requires_grad_() for t in (lens.K, lens.coefficients, items)]
+        assert torch.autograd.gradcheck(function, given, atol=2e-4, rtol=1e-4, eps=1e-6)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
+def test_second_derivatives_are_those_of_differences(model: str) -> None:
+    lens, pixels = CASES[model].lens(), pixels_of(2, seed=3)
+    given = [t.clone().requires_grad_() for t in (lens.K, lens.coefficients, pixels)]
+    back = lambda K, c, x: Lens(K, c, model).unproject(x).rays  # noqa: E731
+    assert torch.autograd.gradgradcheck(back, given, atol=1e-4, rtol=1e-3, eps=1e-6)
+
+
+@EACH
+def test_on_the_axis_derivatives_are_finite(name: str) -> None:
+    lens = ALL[name].lens()
+    center = lens.K[:2, 2][None].clone().requires_grad_()
+    rays, valid = lens.unproject(center)
+    assert valid.all() and rays.tolist() == [[0, 0, 1]]
+    (slope,) = torch.autograd.grad(rays.sum(), center)
+    gain = 1.0
+    if ALL[name].model == "FOV":
+        omega = ALL[name].coefficients[0]
+        gain = 2 * math.tan(omega / 2) / omega
+    assert_close(slope[0], 1 / lens.K.diagonal()[:2] / gain)
+    axis = torch.tensor([[0.0, 0, 2], [0, 0, -2]], dtype=torch.float64, requires_grad=True)
+    pixels, seen = lens.project(axis)
+    (slope,) = torch.autograd.grad(pixels.sum(), axis)
+    assert_close(pixels[0], center[0].detach()) and seen[0]
+    assert_close(slope[0, :2], lens.K.diagonal()[:2] / 2 * gain)
+    if ALL[name].model != "EQUIRECTANGULAR":
+        assert not seen[1] and (slope[1] == 0).all()
+
+
+def test_what_was_measured_beyond_the_turn_of_the_polynomial_is_masked() -> None:
+    lens = TURNING["barrel"].lens()
+    turn = 1 / math.sqrt(3 * 0.2)  # of r - 0.2 r^3
+    points = torch.tensor([[turn * 0.999, 0, 1], [turn * 1.001, 0, 1], [2.0, 0, 1]]).double()
+    assert lens.project(points).valid.tolist() == [True, False, False]
+    last = 655 + 500 * (2 / 3) * turn  # px
+    pixels = torch.tensor([[last - 1e-3, 470], [last + 1e-3, 470], [1279.0, 959.0]]).double()
+    rays, valid = lens.unproject(pixels.requires_grad_())
+    assert valid.tolist() == [True, False, False]
+    (slope,) = torch.autograd.grad(rays.sum(), pixels)
+    assert (slope[1:] == 0).all() and slope.isfinite().all()
+
+
+def test_behind_the_camera_a_fisheye_sees_and_a_pinhole_does_not() -> None:
+    beyond = {"EQUIRECTANGULAR", "SIMPLE_DIVISION", "EUCM"}
+    behind = torch.tensor([[1.0, 0.5, -0.2]]).double()
+    for model, case in CASES.items():
+        seen = case.lens().project(behind).valid
+        assert bool(seen) == ("FISHEYE" in model or model in beyond)
+
+
+@EACH
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300, -1e300, 1e-300])
+def test_numbers_without_sense_are_masked_or_right_and_never_nan(name: str, value: float) -> None:
+    lens = ALL[name].lens()
+    odd = torch.full((1, 3), value, dtype=torch.float64)
+    given = [odd, odd[:, :2], lens.K, lens.coefficients]
+    for spoilt in range(4):
+        points, pixels, K, coefficients = (
+            torch.full_like(t, value) if k == spoilt else t
+            for k, t in enumerate([odd.new_ones(1, 3), odd.new_ones(1, 2), *given[2:]])
+        )
+        inputs = [t.clone().requires_grad_() for t in (K, coefficients, points, pixels)]
+        through = Lens(inputs[0], inputs[1], lens.model)
+        results = [through.project(inputs[2])[0], through.unproject(inputs[3])[0]]
+        assert all(result.isfinite().all() for result in results)
+        gradients = torch.autograd.grad(sum(r.sum() for r in results), inputs, allow_unused=True)
+        assert not any(g.isnan().any() for g in gradients if g is not None)
+
+
+def test_lenses_of_a_batch_broadcast_with_points() -> None:
+    case = CASES["OPENCV"]
+    lens, pixels = case.lens(), pixels_of(7)
+    many = Lens(lens.K.expand(2, 1, 3, 3), lens.coefficients.expand(3, 4), "OPENCV")
+    found = many.unproject(pixels)
+    assert found.rays.shape == (2, 3, 7, 3) and found.valid.shape == (2, 3, 7)
+    assert_close(found.rays, lens.unproject(pixels).rays.expand(2, 3, 7, 3))
+    plain = Lens(lens.K, lens.K.new_zeros(5, 0), "PINHOLE")
+    assert plain.project(found.rays[0, 0]).pixels.shape == (5, 7, 2)
+    with pytest.raises(geom.ShapeError, match="broadcast"):
+        many.unproject(pixels.expand(4, 7, 2))
