@@ -28,7 +28,7 @@ from deltas_geom.triangulation import triangulate as dispatch
 REFINES = {name for name in SOLVERS if name.startswith("refine")}
 FEW = {"triangulate_two_view"}  # who takes no third view
 # Drawn anew for each of twenty solvers: a few examples of each are many.
-FEWER = settings(max_examples=max(1, settings.default.max_examples // 8))
+FEWER = settings(max_examples=max(1, settings.default.max_examples // 5))
 EACH = pytest.mark.parametrize("name", SOLVERS)
 OF_SOLVED = pytest.mark.parametrize("name", [name for name in SOLVERS if name not in REFINES])
 OF_MORE = pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FEW])
