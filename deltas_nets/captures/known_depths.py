@@ -1,4 +1,4 @@
-"""How far away a frame's surfaces are, as far as the capture knows before any network looks."""
+"""How far away a frame's surfaces are, as far as the capture knows without any network."""
 
 import numpy as np
 
@@ -8,7 +8,6 @@ from deltas_nets.captures.frame import FloatArray
 __all__ = [
     "depths_of_sensor",
     "farthest_depth",
-    "known_depths",
     "points_in_view",
     "typical_depths",
 ]
@@ -17,20 +16,6 @@ ENOUGH = 20
 """Points that tell what a frame shows; fewer may all be on one thing."""
 SOME = 2000
 """Pixels of sensor depth that are looked at."""
-
-
-def known_depths(capture: Capture, position: int) -> FloatArray | None:
-    """Depths of a frame's sparse points, or of its sensor; in the capture's unit.
-
-    Args:
-        capture: the frames.
-        position: of the frame among them.
-
-    Returns:
-        ``(D,)`` positive, in no order; None where the capture knows too little.
-    """
-    points = points_in_view(capture, position)
-    return depths_of_sensor(capture, position) if points is None else points[:, 2]
 
 
 def points_in_view(capture: Capture, position: int) -> FloatArray | None:

@@ -60,7 +60,11 @@ def usable_view_sets(
     else:
         found = choose_views(capture, wanted, working_depth=working_depth, anchors=anchors)
         view_sets = found.view_sets
-        _tell_of_short(found, wanted)
+        if wanted <= len(capture.frames):
+            _tell_of_short(found, wanted)
+    most = 1 + max((len(views.sources) for views in view_sets), default=0)
+    if num_views is not None and most < num_views:
+        warn(f"no map is from {num_views} views: there are at most {most} that go together")
     if file is None or num_views is not None:
         view_sets = tuple(v._replace(sources=v.sources[: wanted - 1]) for v in view_sets)
     return UsableViews(view_sets, sum(len(views.sources) < wanted - 1 for views in view_sets))

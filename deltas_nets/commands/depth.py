@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -11,7 +11,6 @@ from deltas_nets import __version__
 from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.depth_formats import MILLIMETRES, DepthFormatName
 from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ class Depth(Captured, Prediction):
     """Views per depth map, the anchor included; all of the view sets', or 5, if not given."""
     keyframes: Flag = False
     """Of a video: maps of those frames alone that see something new."""
-    format: DepthFormatName = "png"
+    format: Literal["png", "npz", "tiff", "pfm"] = "png"
     """Of depth maps: png holds 16-bit steps, the others float32 in the capture's unit."""
     depth_scale: Annotated[float | None, tyro.conf.arg(metavar="STEPS")] = None
     """Steps of depth/ID.png in a unit: 1000 in a metre, which reaches 65.5 m, if not given; of a
@@ -130,8 +129,8 @@ class Depth(Captured, Prediction):
         if self.depth_scale is not None and self.format != "png":
             what = f"depth is written as float32 in {self.format}"
             raise UserError(what, "--depth-scale", "leave it out")
-        scale = MILLIMETRES if self.depth_scale is None else self.depth_scale
-        return sensible(OutputOptions, depth_scale=scale, depth_format=self.format)
+        given = {} if self.depth_scale is None else {"depth_scale": self.depth_scale}
+        return sensible(OutputOptions, depth_format=self.format, **given)
 
     def _fitting(
         self, options: "OutputOptions", capture: "Capture", depth: float | None
@@ -163,6 +162,7 @@ class Depth(Captured, Prediction):
         import torch
 
         from deltas_nets.captures.ids import id_in_json
+        from deltas_nets.outputs.depth_formats import MILLIMETRES
         from deltas_nets.outputs.folder import prepare_output
         from deltas_nets.outputs.summary import FORMAT, SCALE, view_sets_in_json
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
-from deltas_nets.captures.known_depths import known_depths
+from deltas_nets.captures.known_depths import depths_of_sensor, points_in_view
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, frames_of
 from deltas_nets.predict.look import found_depths, look
@@ -69,7 +69,9 @@ class Asked:
 
 
 class Followed:
-    """A search that follows from the capture: its sparse points, its sensor, or a first look.
+    """A search that follows from the capture: from its sparse points, or from a first look.
+
+    Where points pile up at an end of that, sensor depth in metres tells more, or a wider look.
 
     Args:
         capture: the frames.
@@ -83,9 +85,10 @@ class Followed:
         """See `Search`."""
         frames = frames_of(self.capture, views)
         metric = self.capture.metric
-        known = known_depths(self.capture, self._position[views.anchor])
-        if known is not None:
-            reach, sure = reach_of(known, metric=metric), True
+        position = self._position[views.anchor]
+        points = points_in_view(self.capture, position)
+        if points is not None:
+            reach, sure = reach_of(points[:, 2], metric=metric), True
         elif metric:
             reach, sure = Reach(*ROOM), True
         else:
@@ -96,7 +99,11 @@ class Followed:
             piled = end_of_pile(depths, reach)
             if sure and piled is None:
                 return Found(found, reach, None)
-            if piled is not None:
+            # A sensor is in metres; it is asked only now, so that rooms do not depend on it.
+            measured = depths_of_sensor(self.capture, position) if piled and metric else None
+            if measured is not None and reach_of(measured, metric=True) != reach:
+                reach, sure = reach_of(measured, metric=True), True
+            elif piled is not None:
                 reach, sure = wider(reach, piled), False
             elif len(depths):
                 reach, sure = reach_of(depths, metric=metric), True

@@ -16,6 +16,12 @@ class Result:
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
 
+    @property
+    def warnings(self) -> list[str]:
+        """What it warned of, but for the verdict: the networks of tests are not trained."""
+        lines = [line.removeprefix("deltas: warning: ") for line in self.err.splitlines()]
+        return [line for line in lines if not line.startswith("mean confidence")]
+
 
 def runner(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
     """A function that runs `deltas` with arguments."""

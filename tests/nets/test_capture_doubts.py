@@ -61,7 +61,7 @@ def test_any_usual_camera_fits_its_images_and_not_those_turned(
 def warnings_of(run: Run, folder: Path, out: Path, *options: object) -> list[str]:
     result = run("depth", folder, "--out", out, "--size", 32, 32, *options)
     assert result.code == 0, result.err
-    return [line.removeprefix("deltas: warning: ") for line in result.err.splitlines()]
+    return result.warnings
 
 
 def test_a_principal_point_far_from_the_middle_is_a_warning(

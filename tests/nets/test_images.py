@@ -98,14 +98,6 @@ def test_an_image_larger_than_the_memory_is_read_all_the_same(capture: Capture) 
     assert np.array_equal(frame.read_image(), capture.frame(0).read_image())
 
 
-def test_an_image_of_a_lens_that_bends_lines_is_refused(capture: Capture) -> None:
-    bent = replace(capture.frame(0), lens=Lens("SIMPLE_RADIAL", (0.1,)))
-    for read in (bent.check_image, bent.read_image):
-        with pytest.raises(UserError) as error:
-            read()
-        assert error.value.where == bent.image_path and "SIMPLE_RADIAL 0.1" in error.value.what
-
-
 def test_a_frame_without_depth_says_so(capture: Capture) -> None:
     blind = replace(capture.frame(0), depth_path=None)
     for read in (blind.check_depth, blind.read_depth):

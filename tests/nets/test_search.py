@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.known_depths import farthest_depth, known_depths
+from deltas_nets.captures.known_depths import farthest_depth, points_in_view
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.captures.view_choice import choose_view_sets
@@ -113,8 +113,15 @@ def test_sparse_points_spare_the_first_look(capture: Capture, seen: bool) -> Non
     found = Followed(known)(oracle, VIEWS, PredictConfig())
     assert len(oracle.asked) == 1 and np.allclose(found.map.depth, 0.3)
     assert farthest_depth(known) == pytest.approx(0.3)
-    depths = known_depths(known, 1)
-    assert depths is not None and np.allclose(depths, 0.3)
+    points = points_in_view(known, 1)
+    assert points is not None and np.allclose(points[:, 2], 0.3)
+
+
+def test_a_sensor_is_asked_where_points_pile_up(capture: Capture) -> None:
+    near = scaled(capture, 1.0)  # whose sensor says 2.5 m, and the network 0.3 in vain
+    oracle = Oracle(0.3)
+    found = Followed(near)(oracle, VIEWS, PredictConfig())
+    assert oracle.asked[0] == ROOM and len(oracle.asked) > 1 and found.piled is None
 
 
 def test_a_range_that_is_asked_for_is_what_is_searched(capture: Capture) -> None:
