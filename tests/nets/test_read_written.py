@@ -34,6 +34,7 @@ def test_a_capture_is_read_as_it_was_written(layout: str, scene: Scene, tmp_path
     frames = [capture.frame(id) for id in written.ids]
     assert capture.layout.split(",")[0] == layout
     assert (len(capture.frames), capture.lost, capture.metric) == (NUM, {}, written.metric)
+    assert len(capture.doubts) == written.doubts
     poses = np.stack([frame.cam_from_world for frame in frames])
     assert np.allclose(_relative(poses), _relative(scene.cam_from_world), rtol=0, atol=2e-6)
     for frame, depth in zip(frames, scene.depths, strict=True):

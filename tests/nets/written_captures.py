@@ -36,6 +36,7 @@ class Written(NamedTuple):
     lens: tuple[str, tuple[float, ...]] | None = None
     depth: bool = False
     metric: bool = True
+    doubts: int = 0
 
 
 def make_scene() -> Scene:
@@ -125,7 +126,7 @@ def tum(folder: Path, scene: Scene) -> Written:
     _text(folder / "groundtruth.txt", *poses)
     _text(folder / "intrinsics.txt", (F, F, CX, CY, 0.1, -0.2, 0.01, 0.02, 0.3))
     lens = "FULL_OPENCV", (0.1, -0.2, 0.01, 0.02, 0.3, 0.0, 0.0, 0.0)
-    return Written(folder, names, lens, True)
+    return Written(folder, names, lens, True, doubts=1)
 
 
 def record3d(folder: Path, scene: Scene) -> Written:
@@ -149,7 +150,7 @@ def polycam(folder: Path, scene: Scene) -> Written:
         _json(keyframes / f"corrected_cameras/{7 + i}.json", camera | {"width": 128, "height": 96})
         _image(keyframes / "corrected_images" / f"{7 + i}.jpg", scene.images[i])
         _steps(keyframes / "depth" / f"{7 + i}.png", scene.depths[i])
-    return Written(folder, [str(7 + i) for i in range(NUM)], None, True)
+    return Written(folder, [str(7 + i) for i in range(NUM)], None, True, doubts=1)
 
 
 def sevenscenes(folder: Path, scene: Scene) -> Written:
@@ -186,7 +187,7 @@ def opensfm(folder: Path, scene: Scene) -> Written:
     _json(folder / "reconstruction.json", [{**content, "shots": {}}, content])
     _text(folder / "tracks.csv", "OPENSFM_TRACKS_VERSION_v2", "0.jpg\t5\t0\t0.25\t-0.125\t1\t1\t1")
     lens = "FULL_OPENCV", (0.1, 0.2, 0.01, 0.02, 0.3, 0.0, 0.0, 0.0)
-    return Written(folder, [str(i) for i in range(NUM)], lens, metric=False)
+    return Written(folder, [str(i) for i in range(NUM)], lens, metric=False, doubts=1)
 
 
 def openmvg(folder: Path, scene: Scene) -> Written:

@@ -6,7 +6,7 @@ import numpy as np
 
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.images import in_words
-from deltas_nets.captures.readers.image_sizes import at_size
+from deltas_nets.captures.readers.image_sizes import SizedCamera, at_size
 from deltas_nets.errors import UserError
 
 __all__ = ["CORNER", "camera_matrix", "fitted"]
@@ -38,8 +38,8 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, path: Path) -> 
 
 def fitted(
     K: FloatArray, stated: tuple[int, int], size: tuple[int, int], *, image: Path
-) -> FloatArray:
-    """Intrinsics for an image of another size than the capture states.
+) -> SizedCamera:
+    """The camera of an image that may be of another size than the capture states.
 
     Args:
         K: ``(3, 3)`` of images of the stated size.
@@ -48,14 +48,12 @@ def fitted(
         image: the file, for errors.
 
     Returns:
-        ``(3, 3)``, read-only.
+        A camera, whose K is ``(3, 3)`` and read-only.
 
     Raises:
         UserError: one is no resized version of the other: the image is turned or cropped.
     """
-    if stated == size:
-        return K
     if min(stated) < 1:
         what = f"the camera is said to have {in_words(stated)} pixels"
         raise UserError(what, image, "state the size that the intrinsics are for")
-    return at_size(K, None, stated=stated, size=size, image=image).K
+    return at_size(K, None, stated=stated, size=size, image=image)

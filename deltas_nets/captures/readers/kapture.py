@@ -14,6 +14,7 @@ from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
 from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.names import frame_ids
 from deltas_nets.captures.readers.poses import cam_from_world, missing_images, rigid
 from deltas_nets.captures.rotations import rotations_of
@@ -66,6 +67,7 @@ def read(path: Path) -> Capture:
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     missing = []
+    sized: list[SizedCamera] = []
     for id, (number, (stamp, device, name, *_)) in zip(ids, rows, strict=True):
         if device not in sensors:
             what = (
@@ -88,12 +90,13 @@ def read(path: Path) -> Capture:
             lost[id] = pose
             continue
         sensor = sensors[device]
+        sized.append(fitted(sensor.K, sensor.size, size, image=image))
         frames.append(
             Frame(
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(sensor.K, sensor.size, size, image=image),
+                K=sized[-1].K,
                 lens=sensor.lens,
                 cam_from_world=pose,
             )
@@ -101,7 +104,13 @@ def read(path: Path) -> Capture:
     lost |= missing_images(missing, records)
     points = _points(path / "reconstruction" / "points3d.txt")
     return Capture(
-        path, Frames.of(frames, path), lost, layout="kapture", metric=False, points=points
+        path,
+        Frames.of(frames, path),
+        lost,
+        tuple(doubts_of_sizes(sized)),
+        "kapture",
+        metric=False,
+        points=points,
     )
 
 

@@ -157,7 +157,7 @@ def _of_size(K: FloatArray, size: tuple[int, int], path: Path) -> tuple[FloatArr
     for scale in _SCALES:
         if max(abs(across / scale - 1), abs(down / scale - 1)) < 0.15:
             stated = round(height / scale), round(width / scale)
-            return fitted(K, stated, size, image=path), scale
+            return fitted(K, stated, size, image=path).K, scale
     if not (0 < K[0, 2] < width and 0 < K[1, 2] < height):
         what = f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is outside of images of"
         raise UserError(f"{what} {in_words(size)}", path, "scale the intrinsics to the images")

@@ -13,6 +13,7 @@ from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.points import SparsePoints
 from deltas_nets.captures.readers.cameras import camera_matrix, fitted
 from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.names import frame_ids, name_parts
 from deltas_nets.captures.readers.poses import cam_from_world, missing_images, rigid
@@ -67,6 +68,7 @@ def read(path: Path) -> Capture:
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     missing = []
+    sized: list[SizedCamera] = []
     for view, id in zip(views, ids, strict=True):
         if view.pose not in poses or view.intrinsic not in cameras:
             what = f"frame {id} has no pose: OpenMVG could not place it"
@@ -82,12 +84,13 @@ def read(path: Path) -> Capture:
             lost[id] = pose
             continue
         K, lens = cameras[view.intrinsic]
+        sized.append(fitted(K, view.size, size, image=image))
         frames.append(
             Frame(
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(K, view.size, size, image=image),
+                K=sized[-1].K,
                 lens=lens,
                 cam_from_world=pose,
             )
@@ -97,7 +100,13 @@ def read(path: Path) -> Capture:
     place = {id: position for position, id in enumerate(packed)}
     position = {view.key: place[id] for view, id in zip(views, ids, strict=True) if id in place}
     return Capture(
-        folder, packed, lost, layout="OpenMVG", metric=False, points=_points(scene, position)
+        folder,
+        packed,
+        lost,
+        tuple(doubts_of_sizes(sized)),
+        "OpenMVG",
+        metric=False,
+        points=_points(scene, position),
     )
 
 

@@ -12,6 +12,7 @@ from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.cameras import camera_matrix, fitted
 from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.names import frame_ids
 from deltas_nets.captures.readers.poses import (
@@ -68,6 +69,7 @@ def read(path: Path) -> Capture:
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     missing = []
+    sized: list[SizedCamera] = []
     for name, id in ids.items():
         shot = shots.inner(name)
         image = finder.find(name)
@@ -83,18 +85,19 @@ def read(path: Path) -> Capture:
         if called not in cameras:
             raise shot.error(f"is of the camera {called[:60]!r}, which there is not")
         stated, K, lens = cameras[called]
+        sized.append(fitted(K, stated, size, image=image))
         frames.append(
             Frame(
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(K, stated, size, image=image),
+                K=sized[-1].K,
                 lens=lens,
                 cam_from_world=pose,
             )
         )
     lost |= missing_images(missing, file)
-    doubts = []
+    doubts = doubts_of_sizes(sized)
     if len(each) > 1:
         doubts.append(
             f"the largest of {len(each)} reconstructions is read, with {len(names)} images, {file}"

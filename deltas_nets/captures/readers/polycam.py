@@ -9,6 +9,7 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
+from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, missing_images
 from deltas_nets.errors import UserError
@@ -40,6 +41,7 @@ def read(path: Path) -> Capture:
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     missing = []
+    sized: list[SizedCamera] = []
     files = sorted(file for file in cameras.iterdir() if file.suffix.lower() == ".json")
     for file in files:
         id = file.stem
@@ -61,18 +63,20 @@ def read(path: Path) -> Capture:
         if isinstance(pose, Lost):
             lost[id] = pose
             continue
+        sized.append(_intrinsics(fields, size, image))
         depth = folder / "depth" / f"{id}.png"
         frames.append(
             Frame(
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=_intrinsics(fields, size, image),
+                K=sized[-1].K,
                 cam_from_world=pose,
                 depth_path=depth if depth.is_file() else None,
             )
         )
     lost |= missing_images(missing, images)
+    doubts += doubts_of_sizes(sized)
     return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "Polycam", metric=True)
 
 
@@ -90,7 +94,7 @@ def _holds_json(folder: Path) -> bool:
     return any(file.suffix.lower() == ".json" for file in folder.iterdir())
 
 
-def _intrinsics(fields: Fields, size: tuple[int, int], image: Path) -> FloatArray:
+def _intrinsics(fields: Fields, size: tuple[int, int], image: Path) -> SizedCamera:
     """ARKit measures the principal point from the corner of the image."""
     fx, fy, cx, cy = (fields.number(name) for name in ("fx", "fy", "cx", "cy"))
     K = camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=fields.path)

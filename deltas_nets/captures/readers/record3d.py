@@ -9,6 +9,7 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
+from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.numbered import numbered_files
 from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, missing_images, rigid
@@ -45,6 +46,7 @@ def read(path: Path) -> Capture:
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     missing = []
+    sized: list[SizedCamera] = []
     for number in range(len(poses)):
         id = str(number)
         size = image_size_of(images[number]) if number in images else None
@@ -56,18 +58,19 @@ def read(path: Path) -> Capture:
             lost[id] = pose
             continue
         K = camera_matrix(*of_each[number].tolist(), path=file)
+        sized.append(fitted(K, stated, size, image=images[number]))
         frames.append(
             Frame(
                 id=id,
                 image_path=images[number],
                 image_size=size,
-                K=fitted(K, stated, size, image=images[number]),
+                K=sized[-1].K,
                 cam_from_world=pose,
                 depth_path=depths.get(number),
             )
         )
     lost |= missing_images(missing, folder / "rgb")
-    doubts = []
+    doubts = doubts_of_sizes(sized)
     without = len(images.keys() - set(range(len(poses))))
     if without:
         doubts.append(f"{without} images have no pose and are left out, {file}")

@@ -11,6 +11,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.cameras import camera_matrix, fitted
 from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.names import frame_ids
 from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images, rigid
 from deltas_nets.captures.text_lines import read_numbers
@@ -36,6 +37,7 @@ def read(path: Path) -> Capture:
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     missing, bent = [], 0
+    sized: list[SizedCamera] = []
     for file, name, id in zip(files, names, ids, strict=True):
         image = finder.find(name) or finder.find(Path(name).stem)
         size = None if image is None else image_size_of(image)
@@ -56,17 +58,18 @@ def read(path: Path) -> Capture:
             raise UserError("the camera's width and height are no sizes", file, _REMEDY)
         stated = int(sides[1]), int(sides[0])
         matrix = camera_matrix(K[0], K[4], K[2], K[5], path=file)
+        sized.append(fitted(matrix, stated, size, image=image))
         frames.append(
             Frame(
                 id=id,
                 image_path=image,
                 image_size=size,
-                K=fitted(matrix, stated, size, image=image),
+                K=sized[-1].K,
                 cam_from_world=pose,
             )
         )
     lost |= missing_images(missing, path)
-    doubts = []
+    doubts = doubts_of_sizes(sized)
     if bent:
         doubts.append(f"{bent} cameras state a distortion, which is not undone, {path}")
     return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "Strecha", metric=False)
