@@ -1,6 +1,7 @@
 """JSON files of other programs, within bounds, and their values, which may be anything."""
 
 import json
+import math
 from collections import Counter
 from pathlib import Path
 
@@ -126,8 +127,11 @@ class Fields:
         Raises:
             UserError: there is something else, or nothing and no default.
         """
-        if default is not None and self.values.get(key) is None:
+        found = self.values.get(key)
+        if default is not None and found is None:
             return default
+        if isinstance(found, float) and math.isfinite(found):
+            return found  # in most cases; the rest need not be quick
         return float(self.numbers(key, ())[()])
 
     def numbers(self, key: str, shape: tuple[int, ...], *, finite: bool = True) -> FloatArray:
