@@ -10,7 +10,16 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 from run_command import Run, assert_one_line
-from run_fit import CONFIG, assert_same_state, finish, launch, logged, read_checkpoint, train
+from run_fit import (
+    CONFIG,
+    HELD_OUT,
+    assert_same_state,
+    finish,
+    launch,
+    logged,
+    read_checkpoint,
+    train,
+)
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -25,6 +34,7 @@ from deltas_nets.losses.losses import training_losses
 from deltas_nets.losses.points import cell_entropy
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.detector import detector_heatmap
+from deltas_nets.train import fit
 from deltas_nets.train import start as start_module
 from deltas_nets.train import step as step_module
 from deltas_nets.train.batches import Batch, BatchMaker
@@ -232,7 +242,10 @@ def test_what_cannot_teach_is_refused_before_anything_is_written(
     assert not out.exists()
 
 
-def test_the_command_takes_a_teacher(run: Run, tmp_path: Path, files: dict[str, Path]) -> None:
+def test_the_command_takes_a_teacher(
+    run: Run, tmp_path: Path, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit, "validation_rooms", lambda: HELD_OUT)
     out = tmp_path / "run"
     tiny = ["--data.num-rooms", 2, "--data.num-views", 2, "--max-views", 2, "--data.height", 48]
     tiny += ["--data.width", 64, "--data.workers", 0, "--sizes", 48, 64, "--batch-size", 1]
