@@ -11,10 +11,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.check.finding import Mend
 from deltas_nets.errors import UserError
 
-__all__ = ["BY_COMMAND", "changing_frames", "changing_poses", "leaving_out"]
-
-BY_COMMAND = "deltas check CAPTURE --mend OUT writes the capture with this mended"
-"""What all cures of this kind say; the command puts in the names."""
+__all__ = ["changing_frames", "changing_poses", "leaving_out", "scaling_poses"]
 
 
 def changing_poses(change: Callable[[FloatArray], FloatArray]) -> Mend:
@@ -50,5 +47,23 @@ def leaving_out(ids: Collection[str]) -> Mend:
         mask = np.array([id in gone for id in capture.frames], dtype=np.bool_)
         error = UserError("the frame is left out", capture.path, "see deltas check")
         return capture.without(mask, Lost("listed", error))
+
+    return mend
+
+
+def scaling_poses(factor: float) -> Mend:
+    """A mend that multiplies translations, and sparse points with them; sensor depth stays."""
+
+    def change(poses: FloatArray) -> FloatArray:
+        poses[:, :3, 3] *= factor
+        return poses
+
+    def mend(capture: Capture) -> Capture:
+        points, ranges = capture.points, capture.depth_ranges
+        return replace(
+            changing_poses(change)(capture),
+            points=None if points is None else points._replace(xyz=points.xyz * factor),
+            depth_ranges=None if ranges is None else ranges * factor,
+        )
 
     return mend

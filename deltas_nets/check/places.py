@@ -5,10 +5,10 @@ import numpy as np
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.check.finding import Fault, Finding, Mend
-from deltas_nets.check.mending import changing_poses, leaving_out
+from deltas_nets.check.finding import Fault, Finding
+from deltas_nets.check.mending import leaving_out, scaling_poses
 
-__all__ = ["centres_of", "scaled", "wrong_places"]
+__all__ = ["centres_of", "wrong_places"]
 
 STILL = 2e-3  # metres between the farthest cameras
 FROZEN = 2  # frames with an earlier frame's pose, from which on it is no accident
@@ -64,14 +64,4 @@ def _unit(capture: Capture, centres: FloatArray) -> list[Finding]:
         return []
     evidence = f"from a frame to the next the camera moves by {step:.3g} m (median)"
     cure = "if poses are in millimetres, multiply their translations by 0.001"
-    return [Finding(Fault.NOT_METRES, evidence, (), cure, "error", scaled(1e-3))]
-
-
-def scaled(factor: float) -> Mend:
-    """A mend that multiplies all translations."""
-
-    def change(poses: FloatArray) -> FloatArray:
-        poses[:, :3, 3] *= factor
-        return poses
-
-    return changing_poses(change)
+    return [Finding(Fault.NOT_METRES, evidence, (), cure, "error", scaling_poses(1e-3))]

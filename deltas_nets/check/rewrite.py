@@ -7,7 +7,7 @@ import numpy as np
 
 from deltas_nets.captures.frame import FloatArray, Frame
 
-__all__ = ["of_size", "swapped", "with_K", "with_focal"]
+__all__ = ["of_shape", "of_size", "swapped", "with_K", "with_focal"]
 
 
 def of_size(K: FloatArray, factor: float) -> FloatArray:
@@ -15,6 +15,15 @@ def of_size(K: FloatArray, factor: float) -> FloatArray:
     half = factor / 2 - 0.5
     scaled: FloatArray = np.array([[factor, 0, half], [0, factor, half], [0, 0, 1]]) @ K
     return scaled
+
+
+def of_shape(K: FloatArray, old_size: tuple[int, int], new_size: tuple[int, int]) -> FloatArray:
+    """K of images ``(height, width)`` that are resized, each side by its own factor."""
+    down, right = (new / old for new, old in zip(new_size, old_size, strict=True))
+    resized: FloatArray = (
+        np.array([[right, 0, right / 2 - 0.5], [0, down, down / 2 - 0.5], [0, 0, 1]]) @ K
+    )
+    return resized
 
 
 def with_focal(K: FloatArray, factor: float) -> FloatArray:

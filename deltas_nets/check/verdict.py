@@ -12,6 +12,7 @@ from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.trials import level
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.check.depth_camera import unregistered_depth
 from deltas_nets.check.evidence import evidence_of
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.frames_apart import views_apart
@@ -19,6 +20,8 @@ from deltas_nets.check.kinds_of_cameras import wrong_kinds
 from deltas_nets.check.matched import Matched, match_capture
 from deltas_nets.check.mending import leaving_out
 from deltas_nets.check.quick import quick_findings
+from deltas_nets.check.scale import wrong_scale
+from deltas_nets.check.sensor import sensors
 from deltas_nets.check.time_shift import poses_of_other_frames
 from deltas_nets.check.trying import ENOUGH
 from deltas_nets.check.whole import diagnosed, of_all_cameras
@@ -26,6 +29,8 @@ from deltas_nets.network.deltas import Deltas
 
 __all__ = ["Checked", "Figures", "check_capture", "judge_matches"]
 
+_LEAST_PAIRS = 3
+_MOSTLY = 0.6  # of the pairs must fit before depth is held against cameras
 OVERRULED = (Fault.K_OF_OTHER_SIZE, Fault.SIDES_SWAPPED)
 """What a principal point only hints at, and matches know: photos may have been cropped."""
 
@@ -129,7 +134,35 @@ def judge_matches(capture: Capture, matched: Matched) -> tuple[list[Finding], Fi
     figures = Figures(
         total, looked, pairs, int(evidence.counts.sum()), float(given.median()), fit, 0.0
     )
-    return _explained(capture, matched, evidence, given), figures
+    found = _explained(capture, matched, evidence, given)
+    return [*found, *_by_sensor(_same_frames(capture, found), matched, evidence)], figures
+
+
+def _same_frames(capture: Capture, findings: list[Finding]) -> Capture:
+    """The capture mended, where that leaves its frames where they are."""
+    for finding in findings:
+        mended = capture if finding.mend is None else finding.mend(capture)
+        capture = mended if len(mended.frames) == len(capture.frames) else capture
+    return capture
+
+
+def _by_sensor(capture: Capture, matched: Matched, evidence: Evidence) -> list[Finding]:
+    """Findings from sensor depth, on the pairs of frames that cameras fit."""
+    fit = residuals(evidence, *matched.views(capture.frames)) <= ENOUGH
+    if float(fit.double().mean()) < _MOSTLY:
+        return []
+    evidence = evidence.of(fit)
+    pairs = [
+        (matched.positions[one], matched.positions[other]) for one, other in evidence.pairs.tolist()
+    ]
+    if len(pairs) < _LEAST_PAIRS:
+        return []
+    known = sensors(capture.frames, sorted({position for pair in pairs for position in pair}))
+    wrong = wrong_scale(capture, matched, evidence, known)
+    if wrong and wrong[0].mend is not None:
+        capture = wrong[0].mend(capture)
+        known = sensors(capture.frames, list(known))
+    return [*wrong, *unregistered_depth(capture, known, pairs)]
 
 
 def _explained(

@@ -1,0 +1,104 @@
+"""The unit of poses, by what matches triangulate to and a sensor measured."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deltas_geom import PosedViews, triangulate
+from deltas_geom.diagnosis.evidence import Evidence
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.check.finding import Fault, Finding
+from deltas_nets.check.matched import Matched
+from deltas_nets.check.mending import scaling_poses
+from deltas_nets.check.sensor import Sensor
+from deltas_nets.check.trying import ENOUGH
+
+__all__ = ["triangulated_depths", "wrong_scale"]
+
+UNITS = {1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
+TOLERANCE = 0.12  # relative
+FAR = 300.0  # metres, where photos are usually not taken
+_PARALLAX = np.radians(1.0)
+_LEAST = 60  # points
+
+
+def triangulated_depths(views: PosedViews, evidence: Evidence) -> Tensor:
+    """Depth ``(P, M)`` in the first view of each pair, NaN where parallax or residual is bad."""
+    first, second = evidence.pairs.unbind(dim=-1)
+    proj = torch.stack([views.proj[first], views.proj[second]], dim=1)
+    pixels = torch.stack([evidence.first, evidence.second], dim=1)
+    seen = pixels.isfinite().all(dim=-1)
+    found = triangulate(proj, pixels.nan_to_num(), mask=seen)
+    good = found.valid & (found.residual <= ENOUGH) & (found.parallax >= _PARALLAX)
+    return torch.where(good, found.depth[:, 0], torch.nan)
+
+
+def wrong_scale(
+    capture: Capture, matched: Matched, evidence: Evidence, known: Mapping[int, Sensor]
+) -> list[Finding]:
+    """A finding where triangulated and measured depth differ, or nothing is that far away."""
+    depths = triangulated_depths(matched.views(capture.frames), evidence)
+    ratios = _ratios(matched, evidence, depths, known)
+    if len(ratios) >= _LEAST:
+        factor = 1 / float(np.median(ratios))
+        if abs(np.log(factor)) <= TOLERANCE:
+            return []
+        return [_of_sensor(capture, factor, len(ratios))]
+    usual = float(depths.nanmedian())
+    if capture.metric and usual > FAR:
+        return [_of_distance(usual)]
+    return []
+
+
+def _ratios(
+    matched: Matched, evidence: Evidence, depths: Tensor, known: Mapping[int, Sensor]
+) -> FloatArray:
+    """Triangulated by measured depth of all points that have both."""
+    found = [np.zeros(0)]
+    for pair, pixels, triangulated in zip(evidence.pairs, evidence.first, depths, strict=True):
+        view = int(pair[0])
+        sensor = known.get(matched.positions[view])
+        if sensor is None:
+            continue
+        good = triangulated.isfinite()
+        measured = _read(sensor, pixels[good].numpy(), matched.sizes[view])
+        ratio = triangulated[good].numpy()[measured > 0] / measured[measured > 0]
+        found.append(ratio)
+    return np.concatenate(found)
+
+
+def _read(sensor: Sensor, pixels: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Measured depth at pixels ``(N, 2)`` of the colour image at a size; 0 where unknown."""
+    height, width = sensor.depth.shape
+    x = (pixels[:, 0] + 0.5) * width / size[1] - 0.5
+    y = (pixels[:, 1] + 0.5) * height / size[0] - 0.5
+    seen = sensor.K @ np.linalg.inv(sensor.image_K) @ np.stack([x, y, np.ones(len(x))])
+    column, row = np.round(seen[:2] / seen[2]).astype(int)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    depth = sensor.depth[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.where(inside, depth, 0.0).astype(np.float64)
+
+
+def _of_sensor(capture: Capture, factor: float, points: int) -> Finding:
+    unit = next((u for u in UNITS if abs(np.log(factor / u)) < TOLERANCE), None)
+    evidence = (
+        f"what matches triangulate to is {1 / factor:.4g} times as far as the sensor measured "
+        f"(median of {points} points)"
+    )
+    if unit is not None:
+        evidence += f": poses are in {UNITS[unit]}"
+        factor = unit
+    cure = f"multiply the translations of poses by {factor:.4g}"
+    if unit is None:
+        cure += f"; or, if poses are right, depth by {1 / factor:.4g}"
+    cause = Fault.NOT_METRES if unit is not None else Fault.WRONG_SCALE
+    return Finding(cause, evidence, (), cure, "error", scaling_poses(factor))
+
+
+def _of_distance(usual: float) -> Finding:
+    evidence = f"what matches triangulate to is {usual:.3g} m away (median)"
+    cure = "if poses are in millimetres, multiply their translations by 0.001"
+    return Finding(Fault.NOT_METRES, evidence, (), cure, "error", scaling_poses(1e-3))
