@@ -34,7 +34,7 @@ def costs(prediction: DepthPrediction, views: PosedViews) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(place=st.lists(st.floats(-6e6, 6e6), min_size=3, max_size=3))
 def test_depth_and_losses_stay_and_points_move_with_the_world(
     model: Deltas, place: list[float]
