@@ -31,6 +31,10 @@ def there_and_back(name: str, dtype: torch.dtype) -> list[str]:
     return copies
 
 
+# In float64 there are the same operations but the casts.
+@pytest.mark.parametrize(
+    "dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)], ids=str
+)
 @pytest.mark.parametrize("name", [*OPERATIONS, *METHODS])
 def test_an_operation_stays_on_the_device_and_waits_for_nothing(
     name: str, dtype: torch.dtype

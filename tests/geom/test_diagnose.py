@@ -29,6 +29,9 @@ from deltas_geom.diagnosis.evidence import gather_evidence, residuals
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.testing import seeded_scene
 
+# A diagnosis tries every cause: few examples, of which the first is a pattern that nothing moved.
+ONE = settings(max_examples=max(1, settings.default.max_examples // 25))
+PAIRS = settings(max_examples=2 * ONE.max_examples)
 STILL = torch.zeros(4, 3).double()
 ASIDE = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0], [0.9, 0, 0]]).double()
 
@@ -84,7 +87,7 @@ def check_mended(found: Diagnosis, cause: Cause, cameras: tuple[int, ...]) -> No
 
 
 @NAMED
-@settings(max_examples=2)
+@PAIRS
 @given(capture=captures("general"))
 def test_a_planted_fault_is_named_and_mended(
     whose: str, cause: Cause, fault: Fault, capture: Capture
@@ -95,19 +98,18 @@ def test_a_planted_fault_is_named_and_mended(
 
 
 @NAMED
-@settings(max_examples=2)
+@ONE
 @given(capture=captures("general", num_views=6))
 def test_noise_and_mismatches_do_not_mislead(
     whose: str, cause: Cause, fault: Fault, capture: Capture
 ) -> None:
-    for wrong in (0.2, 0.3):
-        found = diagnosed(fault(*capture[:2], spoiled(capture[2], wrong=wrong)))
-        check_mended(found, cause, concerned(whose, cause))
+    found = diagnosed(fault(*capture[:2], spoiled(capture[2], wrong=0.3)))
+    check_mended(found, cause, concerned(whose, cause))
 
 
 @NAMED
 @pytest.mark.parametrize("kind", ["forward", "handheld"])
-@settings(max_examples=2)
+@ONE
 @given(data=st.data())
 def test_a_fault_is_named_wherever_it_shows(
     kind: str, whose: str, cause: Cause, fault: Fault, data: st.DataObject
@@ -120,7 +122,7 @@ def test_a_fault_is_named_wherever_it_shows(
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 1.2, 0.75, 3.0])
-@settings(max_examples=2)
+@ONE
 @given(capture=captures("general"))
 def test_the_factor_of_K_is_found(factor: float, capture: Capture) -> None:
     K, pose, pixels = capture
@@ -130,7 +132,7 @@ def test_the_factor_of_K_is_found(factor: float, capture: Capture) -> None:
 
 
 @pytest.mark.parametrize("factor", [1000.0, 0.01, 0.3048, 1.7])
-@settings(max_examples=2)
+@ONE
 @given(capture=captures("general"))
 def test_the_unit_of_a_translation_is_found(factor: float, capture: Capture) -> None:
     K, pose, pixels = only(1, lambda K, T, x: (K, with_translation(T, factor * T[:, :3, 3]), x))(
@@ -173,7 +175,7 @@ def in_a_box(num_views: int) -> Tensor:
 
 @pytest.mark.parametrize("kind", ["general", "forward", "handheld"])
 @pytest.mark.parametrize("num_views", [2, 3, 10])
-@settings(max_examples=2)
+@ONE
 @given(data=st.data())
 def test_clean_captures_raise_no_alarm(kind: str, num_views: int, data: st.DataObject) -> None:
     K, pose, pixels = data.draw(captures(kind, num_views))
