@@ -82,6 +82,12 @@ READERS: tuple[Reader, ...] = (
 """The first that recognises a folder reads it."""
 
 
+_LAYOUTS = (
+    "a capture is a COLMAP model, a transforms.json, a frames.json, ScanNet's export or one of "
+    f"{len(READERS) - 4} other formats, each with its images: see docs/captures.md"
+)
+
+
 def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> Capture:
     """Read poses, intrinsics and sizes of a capture; no pixels are decoded.
 
@@ -96,16 +102,15 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
         UserError: the folder or a file in it is missing or malformed; the text names it.
     """
     path = Path(path)
-    layouts = "a capture is " + "; or ".join(reader.LAYOUT for reader in READERS)
     if not path.exists():
         raise UserError("the capture does not exist", path, "check the path")
     if not path.is_dir() and not path.is_file():
-        raise UserError("the capture is not a folder", path, layouts)
+        raise UserError("the capture is not a folder", path, _LAYOUTS)
     try:
         reader = next((reader for reader in READERS if reader.recognises(path)), None)
         if reader is None:
             what = "there is no capture in the folder" if path.is_dir() else "this is no capture"
-            raise refusal(path) or UserError(what, path, layouts)
+            raise refusal(path) or UserError(what, path, _LAYOUTS)
         return _usable(_read(reader, path, intrinsics))
     except OSError as error:
         what = f"the capture cannot be read ({error.strerror or error})"

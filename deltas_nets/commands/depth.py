@@ -119,7 +119,14 @@ class Depth(Captured, Prediction):
         search = Followed(capture) if self.depth_range is None else Asked(capture, self.depth_range)
         with progress("depth", len(mine)) as report:
             outcome = predict_capture(
-                predictor, capture, mine, folder, config, search=search, report=report
+                predictor,
+                capture,
+                mine,
+                folder,
+                config,
+                search=search,
+                short=found.short,
+                report=report,
             )
         self._tell(outcome, folder, options)
 
@@ -205,7 +212,6 @@ class Depth(Captured, Prediction):
     def _tell(self, outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions") -> None:
         """What became of it all, in a few lines."""
         from deltas_nets.outputs.summary import SUMMARY, read_summary
-        from deltas_nets.outputs.verdict import verdict
 
         kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
         unit = "" if options.unit == "metre" else f", in {options.unit}"
@@ -226,12 +232,8 @@ class Depth(Captured, Prediction):
                 f"{saturated} maps have depth beyond {most} that is written as {most}: add "
                 f"--depth-scale {options.depth_scale / 10:g} or --format npz; see summary.json"
             )
-        summary = read_summary(self.folder / SUMMARY) or {}
-        if outcome.written:
-            said = verdict(
-                list(folder.frames.values()), short=summary.get("sets_short_of_views", 0)
-            )
-            (warn if said.doubtful else print)(said.line)
-            folder.write_summary(summary.get("status", "complete"), verdict=said.line)
-        if summary.get("waiting_for"):
-            print(f"the folder is complete after --shard {', '.join(summary['waiting_for'])}")
+        if outcome.verdict is not None:
+            (warn if outcome.verdict.doubtful else print)(outcome.verdict.line)
+        waiting = (read_summary(self.folder / SUMMARY) or {}).get("waiting_for", ())
+        if waiting:
+            print(f"the folder is complete after --shard {', '.join(waiting)}")

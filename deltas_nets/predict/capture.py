@@ -9,6 +9,7 @@ from deltas_nets.captures.ids import id_in_json
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.outputs.folder import OutputFolder
 from deltas_nets.outputs.products import FrameOutput
+from deltas_nets.outputs.verdict import Verdict, verdict
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
@@ -25,25 +26,21 @@ class Outcome(NamedTuple):
         kept: maps from before.
         blind: maps without a single triangulated point.
         piled: maps whose points pile up at an end of what was searched.
-        confidences: means of the maps that were written.
+        verdict: on all maps of the folder; None where none was written.
     """
 
     written: int = 0
     kept: int = 0
     blind: int = 0
     piled: int = 0
-    confidences: tuple[float, ...] = ()
+    verdict: Verdict | None = None
 
     def and_one(self, found: Found) -> "Outcome":
         """With one more map written."""
-        confidence = found.map.confidence
         return self._replace(
             written=self.written + 1,
             blind=self.blind + (len(found_depths(found.map)) == 0),
             piled=self.piled + (found.piled is not None),
-            confidences=self.confidences
-            if confidence is None
-            else (*self.confidences, float(confidence.mean())),
         )
 
 
@@ -55,6 +52,7 @@ def predict_capture(
     config: PredictConfig,
     *,
     search: Search | None = None,
+    short: int = 0,
     report: Callable[[str], None] = lambda _: None,
 ) -> Outcome:
     """Write depth, points and confidence, if any, of every view set that is not finished yet.
@@ -66,6 +64,7 @@ def predict_capture(
         folder: from :func:`deltas_nets.outputs.folder.prepare_output`.
         config: sizes, range, confidence.
         search: how depth is searched; in the config's range if not given.
+        short: view sets with fewer views than asked, for the verdict.
         report: called with the id of every finished frame.
 
     Returns:
@@ -92,8 +91,10 @@ def predict_capture(
             report(views.anchor)
         status = "complete"
     finally:
-        folder.write_summary(status, seconds=round(time.perf_counter() - began, 3))
-    return outcome
+        said = verdict(list(folder.frames.values()), short=short)
+        seconds = round(time.perf_counter() - began, 3)
+        folder.write_summary(status, seconds=seconds, verdict=said.line)
+    return outcome._replace(verdict=said) if outcome.written else outcome
 
 
 def _write(

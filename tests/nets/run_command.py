@@ -18,9 +18,9 @@ class Result:
 
     @property
     def warnings(self) -> list[str]:
-        """What it warned of, but for the verdict: the networks of tests are not trained."""
+        """What it warned of, but for bad maps: the networks of tests are not trained."""
         lines = [line.removeprefix("deltas: warning: ") for line in self.err.splitlines()]
-        return [line for line in lines if not line.startswith("mean confidence")]
+        return [line for line in lines if not line.startswith(("mean confidence", "points of"))]
 
 
 def runner(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:

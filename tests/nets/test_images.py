@@ -38,7 +38,7 @@ def test_every_image_is_decoded_once(
     run: Run, make_capture: MakeCapture, tmp_path: Path, decodes: Counter[str], command: str
 ) -> None:
     capture = make_capture()
-    out = ["--out", tmp_path / "out"] if command == "depth" else []
+    out = ["--out", tmp_path / "out", "--depth-range", 0.5, 10] if command == "depth" else []
     assert run(command, capture, *out).code == 0
     names = [f"{id}.jpg" for id in range(4)]
     names += [f"{id}.png" for id in range(4)] if command == "evaluate" else []

@@ -29,7 +29,7 @@ COMMANDS = (
     "depth empty --out OUT",
     "depth nest --out OUT",
     "depth many --out OUT",
-    "depth CAPTURE",
+    "depth --views 3",
     "depth CAPTURE --out CAPTURE",
     "depth CAPTURE --out OUT --vews 3",
     "depth CAPTURE --out OUT --views 1",
