@@ -17,7 +17,7 @@ from posed_captures import captures, image_of
 from deltas_geom.cameras.lenses.lens import Lens as Projector
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapModel, k_and_lens
-from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.readers.colmap_folder import read_model
 from deltas_nets.captures.readers.colmap_text import read_text_model
@@ -359,3 +359,74 @@ def test_samples_open_as_they_are(shared_data: Path, name: str, count: int) -> N
     capture = open_capture(shared_data / "formats" / name)
     assert len(capture.frames) == count and not capture.lost and not capture.doubts
     assert capture.points is not None and capture.points.seen.frame.max() == count - 1
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("name", "model", "pair"),
+    [
+        ("colmap_text", "colmap_ground_truth", ("DSC_0003", "DSC_0004")),
+        ("colmap_text_kapture", "colmap/reconstruction", ("00", "01")),
+    ],
+)
+def test_matches_lie_on_epipolar_lines_as_closely_as_with_pycolmap(
+    shared_data: Path, name: str, model: str, pair: tuple[str, str]
+) -> None:
+    folder = shared_data / "formats" / name
+    frames = [open_capture(folder).frames[id] for id in pair]
+    pixels = sift_matches(*(frame.image_path for frame in frames))
+    theirs = pycolmap.Reconstruction(folder / model)
+    images = [
+        next(image for image in theirs.images.values() if Path(image.name).stem == id)
+        for id in pair
+    ]
+    cameras = [theirs.cameras[image.camera_id] for image in images]
+    oracle = epipolar_residual(
+        [camera.cam_from_img(p + 0.5) for camera, p in zip(cameras, pixels, strict=True)],
+        [image.cam_from_world().matrix() for image in images],
+    )
+    ours = epipolar_residual(
+        [rays_of(frame, p) for frame, p in zip(frames, pixels, strict=True)],
+        [frame.cam_from_world[:3] for frame in frames],
+    )
+    assert ours < 1.2 * oracle
+
+
+def sift_matches(first: Path, second: Path) -> tuple[FloatArray, FloatArray]:
+    """Pixels of good matches, found at half resolution; centres at integers of the whole image."""
+    cv2 = pytest.importorskip("cv2")
+    found = []
+    for path in (first, second):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        found.append(cv2.SIFT_create(2000).detectAndCompute(half, None))
+    pairs = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
+    matches = [best for best, other in pairs if best.distance < 0.75 * other.distance]
+    points = [
+        np.array([keypoints[getattr(match, index)].pt for match in matches])
+        for (keypoints, _), index in zip(found, ("queryIdx", "trainIdx"), strict=True)
+    ]
+    return 2 * (points[0] + 0.5) - 0.5, 2 * (points[1] + 0.5) - 0.5
+
+
+def rays_of(frame: Frame, pixels: FloatArray) -> FloatArray:
+    """Normalised image coordinates without distortion."""
+    lens = frame.lens
+    coefficients = torch.tensor(() if lens is None else lens.coefficients, dtype=torch.float64)
+    camera = Projector(
+        torch.tensor(frame.K), coefficients, "PINHOLE" if lens is None else lens.model
+    )
+    rays = camera.unproject(torch.tensor(pixels)).rays.numpy()
+    return np.asarray(rays[:, :2] / rays[:, 2:])
+
+
+def epipolar_residual(rays: list[FloatArray], poses: list[FloatArray]) -> float:
+    """Median Sampson distance of the better half of matches: false ones are in the other."""
+    first, second = (np.concatenate([each, np.ones((len(each), 1))], axis=1) for each in rays)
+    rotation = poses[1][:, :3] @ poses[0][:, :3].T
+    x, y, z = poses[1][:, 3] - rotation @ poses[0][:, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    lines, back = first @ essential.T, second @ essential
+    squared = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+    distance = np.abs((second * lines).sum(axis=1)) / np.sqrt(squared)
+    return float(np.median(np.sort(distance)[: len(distance) // 2]))

@@ -171,7 +171,7 @@ def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatAr
     """
     rotation, centre = world_from_cam[:3, :3], world_from_cam[:3, 3]
     remedy = "write poses as rigid 4x4 camera-to-world matrices, last row 0 0 0 1"
-    if not np.allclose(world_from_cam[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
+    if not np.abs(world_from_cam[3] - (0, 0, 0, 1)).max() <= 1e-6:
         row = " ".join(f"{value:g}" for value in world_from_cam[3])
         raise UserError(f"the pose's last row is {row}, not 0 0 0 1", path, remedy)
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
