@@ -13,11 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_fit import (
     CONFIG,
+    HELD_OUT,
+    KEPT,
     assert_same_state,
     double_precision,
     finish,
     launch,
     logged,
+    poison,
     read_checkpoint,
     train,
 )
@@ -33,7 +36,6 @@ from deltas_nets.losses.divisors import (
 )
 from deltas_nets.losses.seen import masked_mean
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.rooms import Rooms
 from deltas_nets.train import fit as fit_module
 from deltas_nets.train.batch_norm import Statistics, prepare_batch_norm
 from deltas_nets.train.batches import BatchMaker
@@ -42,7 +44,9 @@ from deltas_nets.train.loader import room_loader
 from deltas_nets.train.processes import check_batch_size
 from deltas_nets.train.step import Objective, unreached
 
-FROZEN = replace(CONFIG, steps=4, freeze_batch_norm=True)
+# Rooms that are drawn in double precision are for no others.
+OWN = replace(CONFIG.data, cache=str(Path(KEPT.name) / "double"))
+FROZEN = replace(CONFIG, steps=3, freeze_batch_norm=True, data=OWN)
 
 
 def assert_close(one: Path, other: Path, tolerance: float) -> None:
@@ -55,42 +59,46 @@ def assert_close(one: Path, other: Path, tolerance: float) -> None:
     for part in ("model", "average"):
         torch.testing.assert_close(second[part], first[part], rtol=0, atol=tolerance)
     for entry, expected in zip(logged(other), logged(one), strict=True):
-        assert entry == pytest.approx(expected, rel=tolerance, abs=tolerance)
+        if expected["total"] != "nan":  # parts of a loss that is none are of one process
+            assert entry == pytest.approx(expected, rel=tolerance, abs=tolerance)
 
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of one process."""
+    """A run of one process, which sees NaN in the second of three steps."""
     folder = tmp_path_factory.mktemp("runs") / "alone"
     with double_precision():
+        poison()
         train(folder, FROZEN, Start())
     content = read_checkpoint(folder)
     assert content["model"]["encoder._bn0.weight"].dtype == torch.float64
     return folder
 
 
-def test_two_processes_train_to_the_weights_of_one(tmp_path: Path, alone: Path) -> None:
+def test_two_processes_train_to_the_weights_of_one_and_both_skip_what_one_sees_as_nan(
+    tmp_path: Path, alone: Path
+) -> None:
     # Here Fabric starts the second process itself.
-    finish(launch(tmp_path / "two", replace(FROZEN, devices=2), "double"))
+    finish(launch(tmp_path / "two", replace(FROZEN, devices=2), "double", "poison=1"))
     assert_close(alone, tmp_path / "two", 1e-9)
-    assert {entry["step"] for entry in logged(tmp_path / "two")} == {1, 2, 3, 4}
+    assert [e["total"] == "nan" for e in logged(tmp_path / "two")] == [False, True, False]
 
 
 @pytest.mark.slow
 def test_two_processes_of_two_passes_train_to_the_weights_of_one(
     tmp_path: Path, alone: Path
 ) -> None:
-    finish(launch(tmp_path / "two", replace(FROZEN, accumulate=2), "double", processes=2))
+    config = replace(FROZEN, accumulate=2)
+    finish(launch(tmp_path / "two", config, "double", "poison=1", processes=2))
     assert_close(alone, tmp_path / "two", 1e-9)
 
 
-def test_nan_in_one_process_is_skipped_by_both_and_ends_both(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_nan_in_one_process_ends_both(tmp_path: Path) -> None:
     said = finish(launch(tmp_path / "run", CONFIG, "poison=1", processes=2), code=1)
     assert (
         said.count("UserError: training diverged: no usable gradient in the 2 steps up to 5") == 2
     )
-    totals = [entry["total"] for entry in logged(tmp_path / "run")]
-    assert [total == "nan" for total in totals] == [False, True, False, True, True]
     content = read_checkpoint(tmp_path / "run")
     assert content["step"] == 3
     assert all(tensor.isfinite().all() for tensor in content["model"].values())
@@ -111,12 +119,12 @@ def test_sigterm_to_one_process_stops_both_after_a_step_and_they_go_on(tmp_path:
 def test_passes_add_up_to_the_gradient_of_the_whole_batch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = Rooms(1, num_views=2, image_size=(48, 64))
-    monkeypatch.setattr(fit_module, "validation_rooms", lambda: few)
+    monkeypatch.setattr(fit_module, "validation_rooms", lambda: HELD_OUT)
     # A step of plain gradient descent shows the gradient; AdamW would blow rounding up.
     monkeypatch.setattr(torch.optim, "AdamW", _descent)
     for name, passes in (("one", 1), ("four", 4)):
-        fit(replace(FROZEN, accumulate=passes), tmp_path / name, Start(), stop=1, log_every=1)
+        config = replace(FROZEN, accumulate=passes, data=CONFIG.data)
+        fit(config, tmp_path / name, Start(), stop=1, log_every=1)
     assert_close(tmp_path / "one", tmp_path / "four", 1e-6)
 
 
