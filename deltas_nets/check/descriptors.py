@@ -41,13 +41,20 @@ class Described(NamedTuple):
 
 
 @torch.inference_mode()
-def describe(network: Deltas, frame: Frame, *, work_pixels: int = WORK_PIXELS) -> Described:
+def describe(
+    network: Deltas,
+    frame: Frame,
+    *,
+    work_pixels: int = WORK_PIXELS,
+    num_keypoints: int = NUM_KEYPOINTS,
+) -> Described:
     """Look at a frame.
 
     Args:
         network: one with descriptors, on any device.
         frame: with an image.
         work_pixels: how many pixels it is looked at with, at most.
+        num_keypoints: that are searched in other frames.
 
     Raises:
         UserError: the image cannot be read.
@@ -56,7 +63,7 @@ def describe(network: Deltas, frame: Frame, *, work_pixels: int = WORK_PIXELS) -
     size = fit_work_size(frame.image_size, max_pixels=work_pixels)
     device = next(network.parameters()).device
     encoded = network.encode(load_image(frame, work_size=size).to(device)[None, None])
-    keypoints = network.detector(encoded.features, image_size=size, num_keypoints=NUM_KEYPOINTS)
+    keypoints = network.detector(encoded.features, image_size=size, num_keypoints=num_keypoints)
     fine = encoded.descriptors.maps[0, 0]
     coarse = F.normalize(F.avg_pool2d(fine[None], 2)[0], dim=0)
     return Described(size, keypoints.pixels[0], fine, coarse)

@@ -13,7 +13,9 @@ _TIMES = 4.0  # as much as the others' residuals is apart
 _SHARE = 0.6  # of a view's pairs
 
 
-def views_apart(evidence: Evidence, residual: Tensor, views: int) -> list[int]:
+def views_apart(
+    evidence: Evidence, residual: Tensor, views: int, *, enough: float = ENOUGH
+) -> list[int]:
     """Views whose matches with most others are off, while those of the others fit.
 
     The worst goes first, and its pairs with it, so that it does not spoil its neighbours.
@@ -22,6 +24,7 @@ def views_apart(evidence: Evidence, residual: Tensor, views: int) -> list[int]:
         evidence: P pairs.
         residual: ``(P)`` px.
         views: how many there are.
+        enough: px, a residual of cameras that fit.
 
     Returns:
         Views; none if they are so many that nobody knows who is right.
@@ -31,7 +34,7 @@ def views_apart(evidence: Evidence, residual: Tensor, views: int) -> list[int]:
     while bool(left.any()):
         # Half of the pairs may be off: the others tell what is usual.
         usual = residual[left].sort().values[: -(-int(left.sum()) // 2)].mean()
-        limit = max(ENOUGH, _TIMES * float(usual))
+        limit = max(enough, _TIMES * float(usual))
         worst, share, off = -1, 0.0, 0.0
         for view in range(views):
             own = residual[left & evidence.with_camera(view)]
@@ -45,6 +48,6 @@ def views_apart(evidence: Evidence, residual: Tensor, views: int) -> list[int]:
         apart.append(worst)
         left &= ~evidence.with_camera(worst)
     agreeing = residual[left]
-    if 3 * len(apart) > views or not len(agreeing) or level(agreeing) > ENOUGH:
+    if 3 * len(apart) > views or not len(agreeing) or level(agreeing) > enough:
         return []
     return sorted(apart)

@@ -11,7 +11,7 @@ from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.mending import changing_frames
 from deltas_nets.check.rewrite import of_size, swapped, with_K
 
-__all__ = ["wrong_intrinsics"]
+__all__ = ["Suspicion", "in_a_line", "suspicion_of", "wrong_intrinsics"]
 
 FOCAL = (0.15, 20.0)
 """Of the longer side: an angle of view of 147 degrees, and one of 3."""
@@ -20,7 +20,7 @@ CENTRAL = 0.08  # parts of the image that a principal point is off the middle, i
 AGREEING = 0.04  # parts within which both axes tell of the same size
 
 
-class _Suspicion(NamedTuple):
+class Suspicion(NamedTuple):
     """What is wrong with one K.
 
     Attributes:
@@ -39,11 +39,11 @@ class _Suspicion(NamedTuple):
 def wrong_intrinsics(capture: Capture) -> list[Finding]:
     """A finding for each kind of nonsense, with the frames of all cameras that have it."""
     arrays = capture.frames.arrays
-    suspicions = [_suspicion(camera.K, camera.image_size) for camera in arrays.cameras]
+    suspicions = [suspicion_of(camera.K, camera.image_size) for camera in arrays.cameras]
     return list(_by_cause(capture, suspicions))
 
 
-def _by_cause(capture: Capture, suspicions: list[_Suspicion | None]) -> Iterator[Finding]:
+def _by_cause(capture: Capture, suspicions: list[Suspicion | None]) -> Iterator[Finding]:
     camera_of = capture.frames.arrays.camera_of
     for cause in dict.fromkeys(one.cause for one in suspicions if one is not None):
         known = [(i, one) for i, one in enumerate(suspicions) if one and one.cause is cause]
@@ -63,14 +63,15 @@ def _rights(camera_of: np.ndarray, right: dict[int, FloatArray]) -> list[FloatAr
     return [right.get(int(camera)) for camera in camera_of]
 
 
-def _suspicion(K: FloatArray, image_size: tuple[int, int]) -> _Suspicion | None:
+def suspicion_of(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
+    """What is wrong with a K for images ``(height, width)``, as far as that shows in numbers."""
     height, width = image_size
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         focal = f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px"
-        return _Suspicion(Fault.NONSENSE_CALIBRATION, focal, "calibrate the camera", None)
+        return Suspicion(Fault.NONSENSE_CALIBRATION, focal, "calibrate the camera", None)
     if abs(K[2, :2]).max() > 1 and abs(K[:2, 2]).max() < 1:
         evidence = f"the principal point ({K[2, 0]:g}, {K[2, 1]:g}) is in the last row"
-        return _Suspicion(Fault.K_TRANSPOSED, evidence, f"write K as {in_a_line(K.T)}", K.T.copy())
+        return Suspicion(Fault.K_TRANSPOSED, evidence, f"write K as {in_a_line(K.T)}", K.T.copy())
     relative, shape = max(K[0, 0], K[1, 1]) / max(image_size), K[1, 1] / K[0, 0]
     if not FOCAL[0] <= relative <= FOCAL[1] or not SHAPES[0] <= shape <= SHAPES[1]:
         evidence = (
@@ -78,11 +79,11 @@ def _suspicion(K: FloatArray, image_size: tuple[int, int]) -> _Suspicion | None:
             f"{relative:.2g} times their longer side"
         )
         cure = "calibrate the camera; photos of a phone are about 0.7 to 0.9 times the longer side"
-        return _Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, None)
+        return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, None)
     return _of_other_images(K, image_size)
 
 
-def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> _Suspicion | None:
+def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
     height, width = image_size
     right, down = (K[0, 2] + 0.5) / width - 0.5, (K[1, 2] + 0.5) / height - 0.5
     point = f"the principal point ({K[0, 2]:.6g}, {K[1, 2]:.6g}) of images of {width}x{height}"
@@ -92,16 +93,16 @@ def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> _Suspicion |
     off = abs((other[0, 2] + 0.5) / width - 0.5), abs((other[1, 2] + 0.5) / height - 0.5)
     if right * down < 0 and max(off) < CENTRAL:
         evidence = f"{point} is in the middle of images of {height}x{width}"
-        return _Suspicion(Fault.SIDES_SWAPPED, evidence, f"write K as {in_a_line(other)}", other)
+        return Suspicion(Fault.SIDES_SWAPPED, evidence, f"write K as {in_a_line(other)}", other)
     factor = 0.5 / (0.5 + (right + down) / 2)
     if abs(right - down) < AGREEING and factor > 0:
         evidence = f"{point} is in the middle of images {1 / factor:.3g} times as large"
         other = of_size(K, factor)
         cure = f"scale it: K times {factor:.4g} is {in_a_line(other)}"
-        return _Suspicion(Fault.K_OF_OTHER_SIZE, evidence, cure, other)
+        return Suspicion(Fault.K_OF_OTHER_SIZE, evidence, cure, other)
     if max(abs(right), abs(down)) > 0.5:
         evidence = f"{point} is outside of them"
-        return _Suspicion(Fault.NONSENSE_CALIBRATION, evidence, "calibrate the camera", None)
+        return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, "calibrate the camera", None)
     return None
 
 

@@ -17,7 +17,7 @@ from deltas_nets.check.matching import match
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 
-__all__ = ["Matched", "match_capture"]
+__all__ = ["Matched", "cameras_of", "match_capture"]
 
 GROUPS = 6
 LEAST = 24  # matches with which two frames go together
@@ -46,14 +46,21 @@ class Matched(NamedTuple):
         return self.pixels.isfinite().all(dim=-1)
 
     def views(self, frames: Frames) -> PosedViews:
-        """The cameras of the frames, straightened and for pixels of the sizes, in float64."""
-        intrinsics = []
-        for position, size in zip(self.positions, self.sizes, strict=True):
-            frame = straight(frames.at(position))
-            K = torch.from_numpy(frame.K.copy())
-            intrinsics.append(resize_intrinsics(K, old_size=frame.image_size, new_size=size))
-        poses = frames.cam_from_world[list(self.positions)]
-        return PosedViews(torch.stack(intrinsics), torch.from_numpy(poses.copy()))
+        """The cameras of the frames, for pixels of the sizes."""
+        return cameras_of(frames, self.positions, self.sizes)
+
+
+def cameras_of(
+    frames: Frames, positions: Sequence[int], sizes: Sequence[tuple[int, int]]
+) -> PosedViews:
+    """Cameras of straightened frames for images of sizes, in float64."""
+    intrinsics = []
+    for position, size in zip(positions, sizes, strict=True):
+        frame = straight(frames.at(position))
+        K = torch.from_numpy(frame.K.copy())
+        intrinsics.append(resize_intrinsics(K, old_size=frame.image_size, new_size=size))
+    poses = frames.cam_from_world[list(positions)]
+    return PosedViews(torch.stack(intrinsics), torch.from_numpy(poses.copy()))
 
 
 def match_capture(

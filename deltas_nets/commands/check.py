@@ -3,12 +3,16 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+    from deltas_nets.check.finding import Finding
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,8 @@ class Check(Command):
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import save_capture
         from deltas_nets.check.matched import GROUPS
-        from deltas_nets.check.refused import checked_refusal
-        from deltas_nets.check.verdict import check_capture
+        from deltas_nets.check.refused import refused
+        from deltas_nets.check.verdict import Checked, check_capture
         from deltas_nets.check.words import report_lines
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.errors import UserError
@@ -58,18 +62,21 @@ class Check(Command):
             check_writable(self.json.parent)
         device = usable_device(self.device)
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = None
+        found: list[Finding] = []
+        capture: Capture | None = None
         try:
             capture = open_capture(self.capture, intrinsics=stated)
         except UserError as error:
-            checked = checked_refusal(self.capture, error)
+            finding, capture = refused(self.capture, error)
+            found = [finding]
+        if capture is None:
+            checked = Checked.of_refused(found)
         else:
             for doubt in capture.doubts:
                 warn(doubt)
+            network = load_model("deltas-small", device=device)
             with progress("matching", GROUPS) as report:
-                checked = check_capture(
-                    capture, load_model("deltas-small", device=device), report=report
-                )
+                checked = check_capture(capture, network, known=found, report=report)
         for line in report_lines(checked, self.capture):
             print(line)
         if self.json is not None:
