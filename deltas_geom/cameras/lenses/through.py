@@ -1,0 +1,133 @@
+"""How points and pixels pass a lens: cameras cleaned once, some items at a time, in float64."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from deltas_geom.cameras.lenses.models import MODELS
+from deltas_geom.cameras.views import finite_intrinsics
+from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.numerics.arithmetic import (
+    finite_or_zero,
+    only,
+    promoted,
+    solver_dtype,
+    unless_all,
+    without_autocast,
+)
+from deltas_geom.numerics.chunks import Cut
+from deltas_geom.numerics.evaluation import recomputed
+
+_LARGEST = 1e30  # of a coefficient, or a pixel in focal lengths
+_FAR = 1e60  # of a coordinate
+_CACHED = 16384
+"""Items at a time, so that what lies between stays in the cache and no threads start."""
+_Both = tuple[Tensor, Tensor]
+
+
+@without_autocast
+def pixels_of_points(K: Tensor, coefficients: Tensor, points: Tensor, model: str) -> _Both:
+    """Pixels of points in the camera's frame through a model, and which are valid."""
+    check_shapes(points=(points, "N 3"))
+    return _through(partial(_pixels, model), model, K, coefficients, points)
+
+
+@without_autocast
+def rays_of_pixels(K: Tensor, coefficients: Tensor, pixels: Tensor, model: str) -> _Both:
+    """Rays of pixels, and which are valid."""
+    check_shapes(pixels=(pixels, "N 2"))
+    return _through(partial(_rays, model), model, K, coefficients, pixels)
+
+
+def _through(
+    function: Callable[..., _Both], model: str, K: Tensor, coefficients: Tensor, items: Tensor
+) -> _Both:
+    """``function`` of cleaned cameras and some items at a time, in the solver's type."""
+    batch = batch_shape(K.shape[:-2], coefficients.shape[:-1], items.shape[:-2])
+    K, coefficients, items = promoted(K, coefficients, items)
+    dtype = solver_dtype(items)
+    # Cameras are few: looked at here, once for all items.
+    K, known = finite_intrinsics(K.to(dtype))
+    coefficients, sound = coefficients.to(dtype), None
+    if coefficients.shape[-1]:  # there is no largest of none
+        coefficients, sound = finite_or_zero(coefficients, limit=_LARGEST)
+    reach = _reach(model, coefficients.detach())
+    few = max(256, _CACHED // max(1, batch.numel()))
+    apart = items.shape[-2] > few and not torch.compiler.is_compiling()
+    found, valid = recomputed(
+        partial(function, True),
+        K,
+        coefficients,
+        reach,
+        items,
+        values=partial(function, False),
+        cut=Cut(few, (0, 0, 0, -2), (-2, -1)) if apart else None,
+    )
+    if known is not None or sound is not None:
+        sound = sound if sound is None else sound.unsqueeze(-1)
+        found = only(found, known, sound)
+        masks = (None if mask is None else mask.squeeze(-1) for mask in (known, sound))
+        valid = only(valid, *masks, other=False)
+    return found.expand(*batch, *found.shape[-2:]), valid.expand(*batch, valid.shape[-1])
+
+
+def _terms(coefficients: Tensor) -> Sequence[Tensor]:
+    """Coefficients, each ``(*B, 1)``."""
+    return coefficients.unsqueeze(-2).unbind(dim=-1) if coefficients.shape[-1] else ()
+
+
+def _reach(model: str, coefficients: Tensor) -> Tensor:
+    measure = MODELS[model].reach
+    if measure is None or not MODELS[model].coefficients:
+        return coefficients.new_full((1,), torch.pi)
+    return measure(_terms(coefficients))
+
+
+def _pixels(
+    model: str, derivable: bool, K: Tensor, coefficients: Tensor, reach: Tensor, points: Tensor
+) -> _Both:
+    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
+    (fx, skew, cx), (_, fy, cy) = of_x.unbind(dim=-2), of_y.unbind(dim=-2)
+    xyz, finite = finite_or_zero(points.to(K.dtype), limit=_FAR)
+    u, v, seen = MODELS[model].pixels(_terms(coefficients), reach, *xyz.unbind(dim=-1))
+    x = torch.addcmul(torch.addcmul(cx, fx, u), skew, v)
+    y = torch.addcmul(cy, fy, v)
+    largest = torch.finfo(points.dtype).max
+    valid = seen & (x.abs() < largest) & (y.abs() < largest)
+    valid = valid if finite is None else valid & finite.squeeze(-1)
+    return _together((x, y), valid, points.dtype, derivable), valid
+
+
+def _rays(
+    model: str, derivable: bool, K: Tensor, coefficients: Tensor, reach: Tensor, pixels: Tensor
+) -> _Both:
+    # Beyond that many px a float64 knows no pixel, nor its square.
+    xy, finite = finite_or_zero(pixels.to(K.dtype), limit=_LARGEST)
+    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
+    (fx, skew, cx), (_, fy, cy) = of_x.unbind(dim=-2), of_y.unbind(dim=-2)
+    x, y = xy.unbind(dim=-1)
+    v = (y - cy) / fy
+    u = torch.addcmul(x - cx, skew, v, value=-1) / fx
+    near = torch.maximum(u.detach().abs(), v.detach().abs()) < _LARGEST
+    small = unless_all(near)
+    u, v = only(u, small), only(v, small)
+    *ray, valid = MODELS[model].rays(_terms(coefficients), reach, u, v, derivable)
+    valid = only(valid, small, finite if finite is None else finite.squeeze(-1), other=False)
+    return _together(ray, valid, pixels.dtype, derivable), valid
+
+
+def _together(
+    parts: Sequence[Tensor], valid: Tensor, dtype: torch.dtype, derivable: bool
+) -> Tensor:
+    """The parts, 0 where not valid, in one tensor."""
+    known = unless_all(valid)
+    parts = [only(part, known) for part in parts]
+    if derivable:
+        return torch.stack(parts, dim=-1).to(dtype)
+    # A stack of many short rows takes ten times as long.
+    found = parts[0].new_empty((*valid.shape, len(parts)), dtype=dtype)
+    for k, part in enumerate(parts):
+        found.select(-1, k).copy_(part)
+    return found
