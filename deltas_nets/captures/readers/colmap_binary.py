@@ -31,6 +31,8 @@ POINT = np.dtype(
 )
 """A point; length times two numbers of 4 bytes follow it."""
 _NAME_LIMIT = 4096
+_AT_ONCE = 2**16
+"""Points that are copied at once: where each byte is takes eight."""
 
 
 class _Bytes:
@@ -139,8 +141,12 @@ def _read_images(file: _Bytes) -> tuple[ColmapImages, ColmapTracks]:
 
 def _read_points(file: _Bytes) -> ColmapPoints:
     starts = _starts_of_points(file, file.count(POINT.itemsize))
-    raw = np.frombuffer(file.data, np.uint8)[starts[:, None] + np.arange(POINT.itemsize)]
-    table = np.ascontiguousarray(raw).view(POINT).reshape(-1)
+    table = np.empty(len(starts), POINT)
+    data, bytes_of_point = np.frombuffer(file.data, np.uint8), np.arange(POINT.itemsize)
+    for first in range(0, len(starts), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        raw = np.ascontiguousarray(data[starts[part, None] + bytes_of_point])
+        table[part] = raw.view(POINT).reshape(-1)
     ids = table["id"].astype(np.int64)
     return ColmapPoints(ids, table["xyz"].copy(), table["rgb"].copy(), table["error"].copy())
 
