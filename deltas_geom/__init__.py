@@ -49,6 +49,11 @@ from deltas_geom.triangulation.rays import triangulate_rays
 from deltas_geom.triangulation.refine import Refined, refine_points
 from deltas_geom.triangulation.results import RobustTriangulation, Triangulation
 from deltas_geom.triangulation.robust import triangulate_robust
+from deltas_geom.triangulation.tracked import (
+    refine_tracks,
+    track_covariance,
+    triangulate_robust_tracks,
+)
 from deltas_geom.triangulation.tracks import TriangulatedTracks, triangulate_tracks
 from deltas_geom.triangulation.triangulate import triangulate, triangulate_points
 from deltas_geom.triangulation.two_view import TwoViewTriangulation, triangulate_two_view
@@ -108,6 +113,7 @@ __all__ = [
     "ray_parallax",
     "refine_points",
     "refine_rays",
+    "refine_tracks",
     "relative_pose",
     "reprojection_residual",
     "resize_intrinsics",
@@ -117,6 +123,7 @@ __all__ = [
     "sample_segments",
     "soft_argmax",
     "to_homogeneous",
+    "track_covariance",
     "triangulate",
     "triangulate_inverse_depth_weighted",
     "triangulate_midpoint",
@@ -124,6 +131,7 @@ __all__ = [
     "triangulate_rays",
     "triangulate_robust",
     "triangulate_robust_rays",
+    "triangulate_robust_tracks",
     "triangulate_tracks",
     "triangulate_two_view",
     "undistort_image",

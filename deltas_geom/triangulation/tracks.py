@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import ShapeError, check_floating, check_index, check_shapes
 from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.records import Record
 from deltas_geom.status import Status
@@ -32,6 +31,7 @@ from deltas_geom.triangulation.track_equations import (
     summed,
     summed_squares,
 )
+from deltas_geom.triangulation.track_groups import check_tracks
 from deltas_geom.triangulation.uncertainty import inverse_information, unscaled
 
 
@@ -135,30 +135,15 @@ def triangulate_tracks(
         >>> Status(tracks.status[1].item()).name
         'TOO_FEW_VIEWS'
     """
-    check_shapes(
-        proj=(proj, "C 3 4"),
-        pixels=(pixels, "T 2"),
-        camera_index=(camera_index, "T"),
-        point_index=(point_index, "T"),
+    check_tracks(
+        num_points,
+        proj=proj,
+        pixels=pixels,
+        camera_index=camera_index,
+        point_index=point_index,
+        weights=weights,
     )
-    check_index(camera_index=camera_index, point_index=point_index)
-    check_floating(proj=proj)
     weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    check_shapes(pixels=(pixels, "T 2"), weights=(weight, "T"))
-    # A list has no batch: cameras and points of all scenes may share one list instead.
-    for name, tensor, dims in (
-        ("proj", proj, ("C", "3", "4")),
-        ("pixels", pixels, ("T", "2")),
-        ("camera_index", camera_index, ("T",)),
-        ("point_index", point_index, ("T",)),
-        ("weights", weight, ("T",)),
-    ):
-        if tensor.dim() != len(dims):
-            wanted = f"({', '.join(dims)})"
-            raise ShapeError(f"{name} must have shape {wanted}, got {tuple(tensor.shape)}")
-    if num_points < 0:
-        raise ValueError(f"num_points must not be negative, got {num_points}")
-
     return operation(
         TriangulatedTracks,
         (proj, pixels, camera_index.long(), point_index.long(), weight),

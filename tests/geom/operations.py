@@ -102,28 +102,44 @@ def sampled(
     )
 
 
-def tracks(proj: Tensor, pixels: Tensor, weights: Tensor) -> Any:
-    """The cameras and points of every item of a batch in one list; its fields by item again."""
-    batch = torch.broadcast_shapes(proj.shape[:-3], pixels.shape[:-3], weights.shape[:-2])
-    size, (views, num) = batch.numel(), pixels.shape[-3:-1]
-    cameras = torch.arange(size * views, device=proj.device).repeat_interleave(num)
-    numbers = torch.arange(size * num, device=proj.device).reshape(size, 1, num)
-    found = geom.triangulate_tracks(
-        proj.expand(*batch, views, 3, 4).reshape(size * views, 3, 4),
-        pixels.expand(*batch, views, num, 2).reshape(size * views * num, 2),
-        cameras,
-        numbers.expand(size, views, num).flatten(),
-        size * num,
-        weights.expand(*batch, views, num).reshape(size * views * num),
-        covariance=True,
+def listed(function: Operation, proj: Tensor, weights: Tensor, **more: Tensor) -> Any:
+    """A function of tracks of the cameras and points of every item of a batch, all in one list.
+
+    The fields of what it returns are by item again.
+    """
+    dims = {"pixels": -3, "points": -2, "pose_covariance": -3}
+    shapes = [proj.shape[:-3], weights.shape[:-2], *(x.shape[: dims[k]] for k, x in more.items())]
+    batch, (views, num) = torch.broadcast_shapes(*shapes), weights.shape[-2:]
+    size = batch.numel()
+
+    def flat(values: Tensor, dim: int, kept: int) -> Tensor:
+        return values.expand(*batch, *values.shape[dim:]).reshape(-1, *values.shape[-kept:][:kept])
+
+    lists = {k: flat(x, dims[k], 2 if k == "pose_covariance" else 1) for k, x in more.items()}
+    camera = torch.arange(size * views, device=proj.device).repeat_interleave(num)
+    point = torch.arange(size * num, device=proj.device).reshape(size, 1, num)
+    found = function(
+        proj=flat(proj, -3, 2),
+        camera_index=camera,
+        point_index=point.expand(size, views, num).flatten(),
+        weights=weights.expand(*batch, views, num).reshape(-1),
+        **lists,
+        **({} if "points" in lists else {"num_points": size * num, "covariance": True}),
     )
-    seen = ("depth", "errors", "used")
-    by_item = {
-        name: field.reshape(*batch, *((views,) * (name in seen)), num, *field.shape[1:])
-        for name, field in found._replace(point_index=None)._asdict().items()
-        if field is not None
-    }
-    return geom.TriangulatedTracks(**by_item, point_index=None)
+
+    def by_item(name: str, field: Tensor) -> Tensor:
+        seen = name in ("depth", "errors", "used")
+        return field.reshape(*batch, *((views,) * seen), num, *field.shape[1:])
+
+    if isinstance(found, Tensor):
+        return by_item("", found)
+    fields = found._replace(**({"point_index": None} if "point_index" in found._fields else {}))
+    named = {k: None if x is None else by_item(k, x) for k, x in fields._asdict().items()}
+    return type(found)(**named)
+
+
+def tracks(proj: Tensor, pixels: Tensor, weights: Tensor) -> Any:
+    return listed(geom.triangulate_tracks, proj, weights, pixels=pixels)
 
 
 def refined(
@@ -197,6 +213,9 @@ OPERATIONS: dict[str, Operation] = {
     "refine_rays": lambda poses, rays, points, weights, mask: geom.refine_rays(
         poses, rays, points, weights, mask, steps=2
     ),
+    "refine_tracks": lambda proj, pixels, points, weights: listed(
+        partial(geom.refine_tracks, steps=2), proj, weights, pixels=pixels, points=points
+    ),
     "relative_pose": lambda pose, other_pose: geom.relative_pose(pose, other_pose),
     "reprojection_residual": lambda proj, points, pixels, weights: geom.reprojection_residual(
         proj, points, pixels, weights
@@ -211,6 +230,9 @@ OPERATIONS: dict[str, Operation] = {
     "sample_segments, pixels": partial(sampled, spacing="pixels"),
     "soft_argmax": lambda logits, positions: geom.soft_argmax(logits, positions, window=2),
     "to_homogeneous": lambda pixels: geom.to_homogeneous(pixels),
+    "track_covariance": lambda proj, points, weights, pose_spread: listed(
+        geom.track_covariance, proj, weights, points=points, pose_covariance=pose_spread
+    ),
     "triangulate": lambda proj, pixels, weights, mask: geom.triangulate(
         proj, pixels, weights, mask, covariance=True
     ),
@@ -236,6 +258,9 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "triangulate_robust_rays": lambda poses, rays, weights, mask: geom.triangulate_robust_rays(
         poses, rays, weights, mask, covariance=True
+    ),
+    "triangulate_robust_tracks": lambda proj, pixels, weights: listed(
+        geom.triangulate_robust_tracks, proj, weights, pixels=pixels
     ),
     "triangulate_tracks": tracks,
     "triangulate_two_view": lambda proj, pixels, mask: geom.triangulate_two_view(

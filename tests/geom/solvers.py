@@ -65,6 +65,7 @@ _NAMES = ("poses", "proj", "pixels", "rays", "weights", "mask", "points")
 _OTHERS = {
     "triangulate_robust": {"views": 5, "robust": True},
     "triangulate_robust_rays": {"views": 5, "robust": True},
+    "triangulate_robust_tracks": {"views": 5, "robust": True},
     "triangulate_two_view": {"views": 2},
 }
 SOLVERS = {

@@ -31,6 +31,7 @@ AT_LEAST_SINGLE = {
     "point_covariance",
     "ray_covariance",
     "sample_map",
+    "track_covariance",
 }
 # Ends of segments are in the image or not by rounding, and poses in half precision rigid.
 BY_ROUNDING = {"correlate, lines", "is_rigid"}
@@ -42,7 +43,10 @@ TAKES_PARTS = {  # of tensors: the table above, not the function
     "rasterize_depth",
     "ray_parallax",
     "sample_map",
+    "refine_tracks",
     "sample_segments",
+    "track_covariance",
+    "triangulate_robust_tracks",
     "triangulate_tracks",
     "triangulate_two_view",
 }
