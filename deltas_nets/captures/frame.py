@@ -70,6 +70,11 @@ class Frame:
     memory: ImageMemory | None = None
     """Where decoded images are kept, if anywhere."""
 
+    @property
+    def extent(self) -> float:
+        """Times the usual pixels that the network should see of it."""
+        return 1.0
+
     def read_image(self) -> NDArray[np.uint8]:
         """Decode the whole image, or take it from the memory.
 

@@ -20,6 +20,8 @@ __all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight"]
 
 WIDEST = np.cos(np.radians(60))
 """What a lens sees farther off its axis is left out: a straight image of it would be all border."""
+MOST = 1.5
+"""Times the usual pixels that the network sees of a wide straight image, so that it is as fine."""
 _ACROSS = 33  # pixels of the photo, along each side, that the straight image is made to hold
 _FINER = 2  # times the wanted size, at which an image is straightened before it is made smaller
 
@@ -37,14 +39,19 @@ class StraightFrame(Frame):
 
     def read_resized(self, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Straighten the photo at about the size that is wanted."""
-        finer = (_FINER * size[0], _FINER * size[1])
         pixels = self.photo.read_image()
+        finer = (_FINER * size[0], _FINER * size[1])
         share = max(finer[0] / self.image_size[0], finer[1] / self.image_size[1])
         if share < 1:
             height, width = self.photo.image_size
             pixels = resize_image(pixels, (round(share * height), round(share * width)))
-            return resize_image(self._straightened(pixels, finer), size)
-        return resize_image(self._straightened(pixels, self.image_size), size)
+        return resize_image(self._straightened(pixels, finer), size)
+
+    @property
+    def extent(self) -> float:
+        """How much more it shows than an image of its size with the photo's focal length."""
+        wider: float = self.photo.K[0, 0] / self.K[0, 0]
+        return min(max(wider**2, 1.0), MOST)
 
     def _straightened(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
         """A photo of any size, as a straight image of any size."""
@@ -53,8 +60,11 @@ class StraightFrame(Frame):
         grid = _grid(
             _Seen.of(self.photo), given, _Straight(self.K.tobytes(), self.image_size), size
         )
-        seen = F.grid_sample(image[None], grid, padding_mode="border", align_corners=False)[0]
-        straightened: NDArray[np.uint8] = seen.round().byte().permute(1, 2, 0).numpy()
+        # Cubic: linear between pixels is a blur, which costs matches.
+        seen = F.grid_sample(
+            image[None], grid, mode="bicubic", padding_mode="border", align_corners=False
+        )[0]
+        straightened: NDArray[np.uint8] = seen.round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
         return straightened
 
 

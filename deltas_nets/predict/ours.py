@@ -112,7 +112,8 @@ def predict_frame(
     """
     device = next(encode.model.parameters()).device
     anchor = frames[0]
-    work_size = config.work_size or fit_work_size(anchor.image_size, max_pixels=WORK_PIXELS)
+    most = round(WORK_PIXELS * anchor.extent)
+    work_size = config.work_size or fit_work_size(anchor.image_size, max_pixels=most)
     images, encoded = encode(frames, work_size=work_size)
     views = anchor_views(frames, work_size=work_size)
     of_one = PosedViews(*(part[None] for part in views.to(device)))
