@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.check.copies import copied_images
-from deltas_nets.check.finding import Finding
+from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.intrinsics import wrong_intrinsics
 from deltas_nets.check.lenses import wrong_lenses
 from deltas_nets.check.lost import lost_frames
 from deltas_nets.check.places import wrong_places
 
-__all__ = ["quick_findings"]
+__all__ = ["TOLD_BEFORE", "quick_findings"]
 
 QUICK: tuple[Callable[[Capture], list[Finding]], ...] = (
     lost_frames,
@@ -20,6 +20,10 @@ QUICK: tuple[Callable[[Capture], list[Finding]], ...] = (
     copied_images,
 )
 """One row a check: from a capture to what is wrong with it."""
+
+
+TOLD_BEFORE = (Fault.POSES_LOST, Fault.IMAGES_MISSING, Fault.NOT_METRES)
+"""What commands that read a capture warn of anyway."""
 
 
 def quick_findings(capture: Capture) -> list[Finding]:

@@ -86,6 +86,7 @@ class Depth(Captured, Prediction):
         from deltas_nets.captures.keyframes import keyframes
         from deltas_nets.captures.usable import check_all, usable_view_sets, warn_of
         from deltas_nets.captures.working_depth import knows_its_scale
+        from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
         from deltas_nets.outputs.products import check_depth_fits
         from deltas_nets.predict.capture import predict_capture
         from deltas_nets.predict.first_look import depth_seen
@@ -111,6 +112,9 @@ class Depth(Captured, Prediction):
         )
         check_all(capture, found.view_sets)
         warn_of(capture, found.view_sets, self.view_sets, self.range)
+        for finding in quick_findings(capture):
+            if finding.cause not in TOLD_BEFORE:
+                warn(f"{finding.cause.value} ({finding.evidence}): {finding.cure}")
         options = self._fitting(options, capture, depth)
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)

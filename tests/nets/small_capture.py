@@ -38,7 +38,8 @@ def write_capture(
         change = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
         write_matrix(folder / "intrinsic" / "intrinsic_depth.txt", change @ K)
     for id in range(num_frames):
-        Image.fromarray(pixels).save(folder / "color" / f"{id}.jpg", quality=95)
+        shown = np.roll(pixels, -round(width * id * step / 2.5), axis=1)
+        Image.fromarray(shown).save(folder / "color" / f"{id}.jpg", quality=95)
         world_from_cam = np.eye(4)
         world_from_cam[:3, 3] = np.array(origin) + np.array([id * step, 0, 0])
         write_matrix(folder / "pose" / f"{id}.txt", world_from_cam)
