@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import with_one
-from deltas_geom.checks import check_floating, check_positive, check_shapes
+from deltas_geom.checks import check_positive, check_shapes
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
@@ -55,7 +55,8 @@ def triangulate_robust_rays(
     Args:
         cam_from_world: ``(*B, V, 4, 4)`` rigid.
         rays: ``(*B, V, N, 3)`` in each camera's frame, of any length but 0; z may be negative.
-            Those of unused views may hold anything.
+            Those of unused views may hold anything. Handed over as (N, V, 3) where N = V they
+            leave hardly an inlier.
         weights: ``(*B, V, N)``, 0 = unused; a sign has no effect. Large ones are rejected last.
         mask: ``(*B, V, N)`` bool, True = used.
         threshold: rad, less than a right angle: beyond it a view is an outlier. 4 px of a focal
@@ -138,7 +139,8 @@ def refine_rays(
         gradient: see :func:`refine_points`.
 
     Returns:
-        Points, weighted RMS angle (rad), could they be refined?
+        Points, weighted RMS angle (rad; large also of rays (N, V, 3), N = V), could they be
+        refined?
 
     Raises:
         ShapeError, TypeError: a trailing shape differs, there is no view, the mask is not bool.
@@ -148,7 +150,6 @@ def refine_rays(
     """
     check_shapes(rays=(rays, "V N 3"), points=(points, "N 3"))
     check_bearings(cam_from_world, rays, weights, mask)
-    check_floating(points=points)
     check_positive(scale=scale)
     seen = see_rays(cam_from_world, rays, weights, mask)
     cameras = _aimed(seen)
@@ -186,6 +187,7 @@ def ray_covariance(
         cam_from_world: ``(*B, V, 4, 4)`` rigid.
         points: ``(*B, N, 3)`` in the world, metres; in front of and behind cameras.
         weights: ``(*B, V, N)``; 0 = unused, as is less than a millionth of the point's largest.
+            (N, V) goes unnoticed where N = V: with one point left out it is an error.
         mask: ``(*B, V, N)`` bool, True = used.
         pose_covariance: ``(*B, V, 6, 6)`` of centres (m) and rotation vectors (rad).
 
@@ -200,7 +202,6 @@ def ray_covariance(
     """
     check_shapes(points=(points, "N 3"), weights=(weights, "V N"))
     check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), weights=(weights, "V N"))
-    check_floating(cam_from_world=cam_from_world, points=points)
     poses, place = promoted(cam_from_world[..., :3, :], points)
     # What is not finite has a ray of length 0, so that it is told, and passes no gradient.
     (near, _), (rows, _) = finite_or_zero(place), finite_or_zero(poses, dims=2)

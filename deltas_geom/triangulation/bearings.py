@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_floating, check_shapes
+from deltas_geom.checks import check_shapes
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
 from deltas_geom.triangulation.observed import Vector3
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
@@ -64,7 +64,6 @@ def check_bearings(
 ) -> torch.Size:
     """The batch dims to which all broadcast; raise unless rays ``(*B, V, N, 3)`` fit cameras."""
     check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), rays=(rays, "V N 3"))
-    check_floating(cam_from_world=cam_from_world, rays=rays)
     return check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_floating, check_shapes
+from deltas_geom.checks import check_shapes
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
 from deltas_geom.numerics.chunks import serial_points
 from deltas_geom.numerics.sums import product
@@ -127,7 +127,6 @@ def check_observed(
 ) -> torch.Size:
     """:func:`check_weights` of pixels ``(*B, V, N, 2)`` seen by cameras ``(*B, V, 3, 4)``."""
     check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"))
-    check_floating(proj=proj)
     return check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
 
 

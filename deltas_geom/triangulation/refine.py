@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
-from deltas_geom.checks import batch_shape, check_floating, check_positive, check_shapes
+from deltas_geom.checks import batch_shape, check_positive, check_shapes
 from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
@@ -112,7 +112,6 @@ def refine_points(
         tensor([[0.2000, 0.1000, 2.0000]])
     """
     check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    check_floating(proj=proj, points=points)
     batch = batch_shape(proj.shape[:-3], points.shape[:-2])
     check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
     if loss not in ("squared", "huber", "cauchy"):

@@ -56,7 +56,8 @@ def triangulate_robust(
 
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
-        pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything.
+        pixels: ``(*B, V, N, 2)`` matches; those of unused views may hold anything. Handed over as
+            (N, V, 2) where N = V they leave hardly an inlier.
         weights: ``(*B, V, N)``, 0 = unused; a sign has no effect. Large ones are rejected last.
         mask: ``(*B, V, N)`` bool, True = used.
         threshold: px, the distance beyond which a view is an outlier, whatever its weight. Of

@@ -34,6 +34,9 @@ def triangulate_robust_tracks(
 ) -> TriangulatedTracks:
     """:func:`triangulate_robust` of tracks: find the observations that are wrong.
 
+    Where indices lead is read: no graph is compiled of it, and a GPU is waited for. So do
+    :func:`refine_tracks` and :func:`track_covariance`.
+
     Args:
         proj: ``(C, 3, 4)`` K [R | t].
         pixels: ``(T, 2)``; those of unused observations may hold anything.

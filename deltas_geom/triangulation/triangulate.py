@@ -28,7 +28,8 @@ def triangulate_points(
 ) -> Tensor:
     """Points ``(*B, N, 3)`` alone; see :func:`triangulate`, which also says which are valid.
 
-    (0, 0, 0) stands for no answer, and may be one.
+    (0, 0, 0) stands for no answer, and may be one. Pixels handed over as (N, V, 2) where N = V go
+    unnoticed here: the residuals of :func:`triangulate` show them.
     """
     return Call(KnownCameras(proj), pixels, weights, mask, frame).points()
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_bool, check_floating, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.numerics.arithmetic import at_least_in_single, solver_dtype, without_autocast
 from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
@@ -29,7 +29,8 @@ def reprojection_residual(
         mask: ``(*B, V, N)`` bool, True = used.
 
     Returns:
-        0 where no view counts, or something used is not finite.
+        0 where no view counts, or something used is not finite. Many pixels also of pixels handed
+        over as (N, V, 2) where N = V.
 
     Raises:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
@@ -41,7 +42,6 @@ def reprojection_residual(
         pixels=(pixels, "V N 2"),
         weights=(weights, "V N"),
     )
-    check_floating(proj=proj)
     batch = batch_shape(proj.shape[:-3], points.shape[:-2])
     batch = check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
     cameras, (places, known) = cameras_of(proj), _clean_points(points)
@@ -63,7 +63,8 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     Args:
         proj: ``(*B, V, 3, 4)``; cameras of unused views may hold anything.
         points: ``(*B, N, 3)``.
-        used: ``(*B, V, N)`` bool.
+        used: ``(*B, V, N)`` bool. (N, V) goes unnoticed where N = V: with one point left out it is
+            an error.
 
     Returns:
         0 where fewer than two views are used, or the point or a used camera is not finite.
@@ -73,7 +74,6 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
         TypeError: ``proj`` is not floating point, or ``used`` not bool.
     """
     check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
-    check_floating(proj=proj)
     check_bool(used=used)
     batch_shape(proj.shape[:-3], points.shape[:-2], used.shape[:-2])
     cameras, (places, known) = cameras_of(proj.detach()), _clean_points(points.detach())
@@ -103,6 +103,7 @@ def point_covariance(
             place like any other, and known well if cameras see it: give such points no weight,
             ``weights * result.valid``, or leave them out, ``mask & result.valid``.
         weights: ``(*B, V, N)``; 0 = unused, as is less than a millionth of the point's largest.
+            (N, V) goes unnoticed where N = V: with one point left out it is an error.
         mask: ``(*B, V, N)`` bool, True = used.
         pose_covariance: ``(*B, V, 6, 6)`` of each camera's centre (m) and rotation vector (rad),
             both along the world's axes, independent from view to view; adds what uncertain
@@ -141,7 +142,6 @@ def point_covariance(
     if pose_covariance is not None:
         check_shapes(proj=(proj, "+V 3 4"), pose_covariance=(pose_covariance, "V 6 6"))
         shapes.append(pose_covariance.shape[:-3])
-    check_floating(proj=proj)
     check_bool(mask=mask)
     batch = batch_shape(*shapes)
     cameras, (places, known) = cameras_of(proj), _clean_points(points)
@@ -185,7 +185,6 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         tensor([[9.]])
     """
     check_shapes(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
-    check_floating(proj=proj, covariance=covariance)
     batch_shape(proj.shape[:-3], covariance.shape[:-3])
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
     cameras, work = cameras_of(proj), solver_dtype(proj)

@@ -11,7 +11,6 @@ from stand_in_device import DEVICE, MixedDevices, on_device, one_device, to_devi
 
 from deltas_geom.testing.fixed_scenes import seeded_scene
 
-
 # How long tracks are decides what is computed at a time: these read indices, and say so.
 GROUP = {"refine_tracks", "track_covariance", "triangulate_robust_tracks"}
 

@@ -1,5 +1,7 @@
 """What the results of all solvers have in common: errors, covariance, parallax, limits."""
 
+import inspect
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -264,6 +266,21 @@ def test_a_limit_is_positive(name: str) -> None:
     s = Sights(poses, poses[:, :3], torch.ones(4, 4, 2), torch.ones(4, 4, 3), torch.ones(4, 4))
     with pytest.raises(ValueError, match="max_residual must be positive, got 0"):
         SOLVERS[name](s, max_residual=0.0)
+
+
+def test_every_function_of_views_says_how_points_before_views_are_noticed() -> None:
+    public = {name: getattr(geom, name) for name in geom.__all__ if name != "diagnose"}
+    of_views = {
+        name: function.__doc__
+        for name, function in public.items()
+        if inspect.isfunction(function)
+        and {"pixels", "rays", "weights", "used"} & {*inspect.signature(function).parameters}
+        and ("V, N" in function.__doc__ or "triangulate" in name)
+    }
+    # A list has indices to mix up; who only refers to another function has nothing to add.
+    says = re.compile(r"\((\*B, )?N, [V2]|[Ii]ndices|returns and raises are those of")
+    assert {name for name, text in of_views.items() if not says.search(text)} == set()
+    assert len(of_views) > 12
 
 
 @EACH
