@@ -1,11 +1,12 @@
 """DeMoN's data as DPSNet prepared it: cam.txt, poses.txt, 0000.jpg and 0000.npy of depth."""
 
+from array import array
 from pathlib import Path
 
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.intrinsics import read_intrinsics
@@ -64,15 +65,15 @@ def read(path: Path) -> Capture:
     return Capture(path, Frames.of(frames, path), lost, layout="DeMoN", metric=True)
 
 
-def _rows(path: Path) -> np.ndarray:
+def _rows(path: Path) -> FloatArray:
     """``(F, 12)``."""
-    rows = []
+    numbers = array("d")
     for number, words in read_lines(path, name="list of poses", remedy=_REMEDY):
         if len(words) != 12:
             raise UserError(f"line {number} has {len(words)} numbers, not 12", path, _REMEDY)
         try:
-            rows.append([float(word) for word in words])
+            numbers.extend(map(float, words))
         except ValueError as error:
             what = f"line {number} holds {' '.join(words)[:40]!r} where numbers should be"
             raise UserError(what, path, _REMEDY) from error
-    return np.array(rows, dtype=np.float64).reshape(-1, 12)
+    return np.array(numbers).reshape(-1, 12)

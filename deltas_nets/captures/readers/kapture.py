@@ -38,14 +38,14 @@ class _Sensor(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """Device from world, or sensor from rig."""
+    """Device from world, or sensor from rig: qw qx qy qz tx ty tz."""
 
-    quaternion: FloatArray
-    translation: FloatArray
+    numbers: tuple[float, ...]
 
     @property
     def matrix(self) -> FloatArray:
-        return rigid(rotations_of(self.quaternion), self.translation)
+        quaternion, translation = np.split(np.array(self.numbers), (4,))
+        return rigid(rotations_of(quaternion), translation)
 
 
 def recognises(path: Path) -> bool:
@@ -74,16 +74,16 @@ def read(path: Path) -> Capture:
                 f"line {number} is of the sensor {device[:40]!r}, which is no camera that is read"
             )
             raise UserError(what, records, "calibrate it: sensors.txt takes models of COLMAP's")
+        image = finder.find(name)
+        size = None if image is None else image_size_of(image)
+        if image is None or size is None:
+            missing.append(id)
+            continue
         matrix = _cam_from_world(stamp, device, poses, rigs)
         if matrix is None:
             what = f"frame {id} has no pose"
             remedy = "add it to the trajectories, or take the frame out of the view sets"
             lost[id] = Lost("no pose", UserError(what, folder / "trajectories.txt", remedy))
-            continue
-        image = finder.find(name)
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
             continue
         pose = cam_from_world(matrix, id=id, path=folder / "trajectories.txt")
         if isinstance(pose, Lost):
@@ -194,9 +194,8 @@ def _rigs(path: Path) -> Mapping[str, Sequence[tuple[str, _Pose]]]:
 def _pose(words: Sequence[str], line: int, path: Path) -> _Pose:
     """A pose may be partial: what is empty is not known."""
     if any(word == "" for word in words[:7]):
-        return _Pose(np.full(4, np.nan), np.full(3, np.nan))
-    numbers = np.array(_numbers(words[:7], line, path))
-    return _Pose(numbers[:4], numbers[4:])
+        return _Pose((np.nan,) * 7)
+    return _Pose(tuple(_numbers(words[:7], line, path)))
 
 
 def _cam_from_world(

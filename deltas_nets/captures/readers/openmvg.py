@@ -47,7 +47,7 @@ class _View(NamedTuple):
 def recognises(path: Path) -> bool:
     """Whether the folder holds sfm_data.json at most two folders down, or the file is one."""
     if path.is_file():
-        return path.name.startswith("sfm_data") and path.suffix == ".json"
+        return b'"sfm_data_version"' in _head(path)
     return _file(path) is not None
 
 
@@ -108,6 +108,11 @@ def read(path: Path) -> Capture:
         metric=False,
         points=_points(scene, position),
     )
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(4096)
 
 
 def _file(path: Path) -> Path | None:

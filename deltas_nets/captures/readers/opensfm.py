@@ -43,7 +43,8 @@ _LENSES = {
 def recognises(path: Path) -> bool:
     """Whether the folder holds a reconstruction, or the file is one."""
     if path.is_file():
-        return path.name.startswith("reconstruction") and path.suffix == ".json"
+        head = _head(path)
+        return head.lstrip()[:1] == b"[" and b'"cameras"' in head
     return _file(path) is not None
 
 
@@ -112,6 +113,11 @@ def read(path: Path) -> Capture:
         metric=False,
         points=_points(best, folder, packed, ids),
     )
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(4096)
 
 
 def _file(path: Path) -> Path | None:
