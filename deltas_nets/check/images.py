@@ -41,7 +41,7 @@ class _Seen(NamedTuple):
 
 def look_at_images(capture: Capture) -> list[Finding]:
     """Findings of blurred and repeated images, and of files that cannot be used."""
-    step = -(-len(capture.frames) // MOST)
+    step = max(1, -(-len(capture.frames) // MOST))
     seen, broken = [], dict[str, str]()
     for position in range(0, len(capture.frames), step):
         frame = capture.frames.at(position)
@@ -65,8 +65,9 @@ def _look(frame: Frame, position: int) -> _Seen | str:
         with Image.open(open_span(frame.image_path, frame.image_span)) as image:
             image.draft("L", (WIDTH, WIDTH * 2 // 3))
             grey = image.convert("L")
-            height = max(8, WIDTH * grey.height // grey.width)
-            small = grey.resize((WIDTH, height), Image.Resampling.BOX)
+            width = min(WIDTH, grey.width)
+            height = max(8, width * grey.height // grey.width)
+            small = grey.resize((width, height), Image.Resampling.BOX)
             thumb = small.resize(THUMB[::-1], Image.Resampling.BOX)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         return type(error).__name__

@@ -15,6 +15,7 @@ __all__ = ["Suspicion", "in_a_line", "suspicion_of", "wrong_intrinsics"]
 
 FOCAL = (0.15, 20.0)
 """Of the longer side: an angle of view of 147 degrees, and one of 3."""
+USUAL_FOCAL = 0.85
 SHAPES = (0.6, 1.7)  # fy / fx
 CENTRAL = 0.08  # parts of the image that a principal point is off the middle, if nobody cropped
 AGREEING = 0.04  # parts within which both axes tell of the same size
@@ -68,7 +69,9 @@ def suspicion_of(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None
     height, width = image_size
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         focal = f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px"
-        return Suspicion(Fault.NONSENSE_CALIBRATION, focal, "calibrate the camera", None)
+        guess = usual_K(K, image_size)
+        cure = f"calibrate the camera; many have about {in_a_line(guess)} for such images"
+        return Suspicion(Fault.NONSENSE_CALIBRATION, focal, cure, guess)
     if abs(K[2, :2]).max() > 1 and abs(K[:2, 2]).max() < 1:
         evidence = f"the principal point ({K[2, 0]:g}, {K[2, 1]:g}) is in the last row"
         return Suspicion(Fault.K_TRANSPOSED, evidence, f"write K as {in_a_line(K.T)}", K.T.copy())
@@ -78,8 +81,9 @@ def suspicion_of(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None
             f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px for images of {width}x{height}, "
             f"{relative:.2g} times their longer side"
         )
-        cure = "calibrate the camera; photos of a phone are about 0.7 to 0.9 times the longer side"
-        return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, None)
+        guess = usual_K(K, image_size)
+        cure = f"calibrate the camera; many have about {in_a_line(guess)} for such images"
+        return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, guess)
     return _of_other_images(K, image_size)
 
 
@@ -104,6 +108,16 @@ def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | 
         evidence = f"{point} is outside of them"
         return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, "calibrate the camera", None)
     return None
+
+
+def usual_K(K: FloatArray, image_size: tuple[int, int]) -> FloatArray:
+    """K of a usual lens, with the principal point where it is said to be, if that can be."""
+    height, width = image_size
+    x, y = K[0, 2], K[1, 2]
+    central = abs((x + 0.5) / width - 0.5) < CENTRAL and abs((y + 0.5) / height - 0.5) < CENTRAL
+    x, y = (x, y) if central else ((width - 1) / 2, (height - 1) / 2)
+    focal = USUAL_FOCAL * max(image_size)
+    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
 
 def in_a_line(K: FloatArray) -> str:

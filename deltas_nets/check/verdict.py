@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.finding import Fault, Finding
+from deltas_nets.check.guesses import improved_guess
 from deltas_nets.check.image_sizes import wrong_sizes
 from deltas_nets.check.images import look_at_images
 from deltas_nets.check.judging import Figures, judge_matches
@@ -20,8 +21,8 @@ __all__ = ["Checked", "check_capture"]
 
 OVERRULED = (Fault.K_OF_OTHER_SIZE, Fault.SIDES_SWAPPED)
 """What a principal point only hints at, and matches know: photos may have been cropped."""
-HOPELESS = (Fault.NONSENSE_CALIBRATION, Fault.NONSENSE_LENS, Fault.NO_BASELINE)
-"""With which matches tell nothing more."""
+GUESSED = (Fault.NONSENSE_CALIBRATION, Fault.NONSENSE_LENS)
+"""What is mended by a guess, which matches then improve."""
 
 
 class Checked(NamedTuple):
@@ -81,18 +82,27 @@ def check_capture(
     readable = sizes[0].mend(capture) if sizes and sizes[0].mend is not None else capture
     certain = [*known, *sizes]
     found = [*quick_findings(readable), *look_at_images(readable)]
-    if any(finding.cause in HOPELESS for finding in found):
+    if any(finding.cause is Fault.NO_BASELINE for finding in found):
         figures = Figures(len(capture.frames), 0, 0, 0, float("nan"), 0.0, 0.0)
         return _checked([*certain, *found], figures, start)
+    guesses = [finding for finding in found if finding.cause in GUESSED]
+    for guess in guesses:
+        readable = readable if guess.mend is None else guess.mend(readable)
     matched = match_capture(readable, network, report=report)
     more, figures = judge_matches(readable, matched)
     if figures.pairs:
         told = {*OVERRULED, *(one.cause for one in more)}
+        if Fault.POSES_OF_OTHER_FRAMES in told:
+            told.add(Fault.FROZEN_POSES)  # those that filled up a list that was too short
         found = [one for one in found if one.cause not in told]
-    more = [
-        _all_apart(readable, network, one) if one.cause is Fault.FRAMES_DISAGREE else one
-        for one in more
-    ]
+    if figures.looked_at < len(readable.frames):
+        more = [
+            _all_apart(readable, network, one) if one.cause is Fault.FRAMES_DISAGREE else one
+            for one in more
+        ]
+    if guesses:
+        improved, more = improved_guess(guesses[-1], more, readable)
+        found = [improved if one is guesses[-1] else one for one in found]
     return _checked([*certain, *found, *more], figures, start)
 
 

@@ -1,0 +1,156 @@
+"""Own matches of a capture tell what is wrong with its cameras; the cure mends it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from check_plants import MATCHES, with_depth_of_a_kinect
+from conftest import write_scene
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.check.finding import Fault, Finding
+from deltas_nets.check.judging import judge_matches
+from deltas_nets.check.matched import Matched, match_capture
+from deltas_nets.check.quick import quick_findings
+from deltas_nets.rooms import render_room
+from deltas_nets.weights_file import load_model
+
+REAL = ("hololens", "sevenscenes_reg", "tum_fr3_cabinet")
+BY_DAY = ("inverted", "one K in three", "five frames late", "one pose in ten")
+
+
+class Looked(NamedTuple):
+    """A capture without faults, and its matches, which no fault of cameras changes."""
+
+    capture: Capture
+    matched: Matched
+
+    def judged(self, planted: Capture) -> list[Finding]:
+        """Findings of the capture with other cameras, or fewer frames."""
+        place = {id: position for position, id in enumerate(planted.frames)}
+        ids = [self.capture.frames.id_at(position) for position in self.matched.positions]
+        kept = [view for view, id in enumerate(ids) if id in place]
+        matched = Matched(
+            tuple(place[ids[view]] for view in kept),
+            self.matched.pixels[kept],
+            tuple(self.matched.sizes[view] for view in kept),
+            {},
+        )
+        return judge_matches(planted, matched)[0]
+
+
+Look = Callable[[str], Looked]
+
+
+@pytest.fixture(scope="module")
+def look(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Look:
+    """A capture by name, matched when it is first asked for."""
+    known: dict[str, Looked] = {}
+
+    def find(name: str) -> Looked:
+        if name not in known:
+            if name == "room":
+                folder = tmp_path_factory.mktemp("room") / "capture"
+                write_scene(folder, render_room(3, num_views=11, image_size=(192, 256)))
+            else:
+                folder = request.getfixturevalue("shared_data") / name
+            capture = open_capture(folder)
+            known[name] = Looked(capture, match_capture(capture, load_model()))
+        return known[name]
+
+    return find
+
+
+def assert_named_and_mended(looked: Looked, name: str) -> None:
+    plant, cause = MATCHES[name]
+    planted = plant(looked.capture)
+    (found,) = looked.judged(planted)
+    assert found.cause is cause, (found, cause)
+    assert found.mend is not None and found.cure and found.severity == "error"
+    assert looked.judged(found.mend(planted)) == []
+
+
+def assert_depth_of_a_kinect_is_named(looked: Looked, folder: Path) -> None:
+    planted = with_depth_of_a_kinect(looked.capture, folder)
+    (found,) = looked.judged(planted)
+    assert found.cause is Fault.DEPTH_NOT_REGISTERED and "585" in found.evidence
+    assert found.mend is not None and looked.judged(found.mend(planted)) == []
+
+
+def test_a_room_that_is_well_raises_no_alarm(look: Look) -> None:
+    looked = look("room")
+    found, figures = judge_matches(*looked)
+    assert found == [] and quick_findings(looked.capture) == []
+    assert figures.residual < 0.3 and figures.fit == 1 and figures.looked_at == 11
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n in BY_DAY else pytest.mark.slow) for n in MATCHES]
+)
+def test_faults_planted_in_a_room_are_named_and_mended(name: str, look: Look) -> None:
+    assert_named_and_mended(look("room"), name)
+
+
+def test_depth_of_another_camera_in_a_room_is_named(look: Look, tmp_path: Path) -> None:
+    assert_depth_of_a_kinect_is_named(look("room"), tmp_path)
+
+
+@pytest.mark.parametrize("fault", ["none", "inverted", "one pose in ten"])
+def test_three_matches_in_ten_may_be_wrong(fault: str, look: Look) -> None:
+    capture, matched = look("room")
+    generator = torch.Generator().manual_seed(0)
+    anywhere = torch.rand(matched.pixels.shape, generator=generator).double()
+    anywhere *= torch.tensor(matched.sizes[0][::-1])
+    wrong = torch.rand(matched.pixels.shape[:2], generator=generator) < 0.16  # of the pixels
+    spoiled = torch.where((wrong & matched.seen)[..., None], anywhere, matched.pixels)
+    looked = Looked(capture, matched._replace(pixels=spoiled))
+    if fault == "none":
+        assert looked.judged(capture) == []
+    else:
+        assert_named_and_mended(looked, fault)
+
+
+def test_frames_that_share_nothing_say_that_nothing_can_be_told(look: Look) -> None:
+    capture, matched = look("room")
+    blind = matched._replace(pixels=torch.full_like(matched.pixels, torch.nan))
+    (found,), figures = judge_matches(capture, blind)
+    assert found.cause is Fault.FEW_MATCHES and figures.pairs == 0
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    "name", ["tum_fr1_desk9", *(pytest.param(n, marks=pytest.mark.slow) for n in REAL)]
+)
+def test_real_captures_raise_no_alarm(name: str, look: Look) -> None:
+    looked = look(name)
+    assert judge_matches(*looked)[0] == [] and quick_findings(looked.capture) == []
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+@pytest.mark.parametrize("fault", MATCHES)
+@pytest.mark.parametrize("name", REAL)
+def test_faults_of_real_captures_are_named_and_mended(name: str, fault: str, look: Look) -> None:
+    looked = look(name)
+    if fault != "one pose in ten":
+        assert_named_and_mended(looked, fault)
+        return
+    # Those looked at; `deltas check` looks at all frames then.
+    plant, cause = MATCHES[fault]
+    planted = plant(looked.capture)
+    (found,) = looked.judged(planted)
+    moved = planted.frames.cam_from_world != looked.capture.frames.cam_from_world
+    ids = np.array(list(planted.frames))[moved.any(axis=(1, 2))]
+    seen = {looked.capture.frames.id_at(position) for position in looked.matched.positions}
+    assert found.cause is cause and set(found.frames) == set(ids) & seen
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+@pytest.mark.parametrize("name", REAL)
+def test_depth_of_another_camera_is_named(name: str, look: Look, tmp_path: Path) -> None:
+    assert_depth_of_a_kinect_is_named(look(name), tmp_path)

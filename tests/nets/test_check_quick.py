@@ -1,0 +1,95 @@
+"""What files and cameras tell of a capture before any image is looked at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from check_plants import CAMERAS
+from conftest import MakeCapture
+from PIL import Image, ImageFilter
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.check.finding import Fault
+from deltas_nets.check.image_sizes import wrong_sizes
+from deltas_nets.check.images import look_at_images
+from deltas_nets.check.quick import quick_findings
+
+
+@pytest.fixture
+def whole(make_capture: MakeCapture) -> Capture:
+    """Nine frames, each with an image of its own."""
+    folder = make_capture(9, image_size=(96, 128), depth_size=(96, 128))
+    random = np.random.default_rng(0)
+    for id in range(9):
+        pixels = random.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        image = Image.fromarray(pixels).resize((128, 96))
+        image.save(folder / "color" / f"{id}.jpg", quality=95)
+    return open_capture(folder)
+
+
+def causes(capture: Capture) -> list[Fault]:
+    return [finding.cause for finding in quick_findings(capture)]
+
+
+def test_nothing_is_found_in_a_capture_that_is_well(whole: Capture) -> None:
+    assert causes(whole) == [] and look_at_images(whole) == [] and wrong_sizes(whole) == []
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_planted_fault_is_named_and_its_mend_mends_it(name: str, whole: Capture) -> None:
+    plant, cause = CAMERAS[name]
+    planted = plant(whole)
+    (found,) = quick_findings(planted)
+    assert found.cause is cause and found.cure and found.evidence
+    if found.mend is not None:
+        assert causes(found.mend(planted)) == []
+    else:
+        assert cause is Fault.NO_BASELINE
+
+
+def test_lost_poses_are_named_by_frame(make_capture: MakeCapture) -> None:
+    folder = make_capture(5)
+    (folder / "pose" / "3.txt").write_text("nan " * 16)
+    (folder / "pose" / "4.txt").write_text("-inf " * 16)
+    capture = open_capture(folder)
+    found = next(one for one in quick_findings(capture) if one.cause is Fault.POSES_LOST)
+    assert found.frames == ("3", "4") and found.severity == "warning" and found.mend is not None
+    assert Fault.POSES_LOST not in causes(found.mend(capture))
+
+
+@pytest.mark.parametrize(
+    "lens", [Lens("OPENCV", (0.26, -0.95, -0.005, 0.003)), Lens("SIMPLE_RADIAL", (-0.3,))]
+)
+def test_lenses_that_there_are_raise_no_alarm(lens: Lens, whole: Capture) -> None:
+    frames = Frames.of((replace(f, lens=lens) for f in whole.frames.values()), whole.path)
+    assert causes(replace(whole, frames=frames)) == []
+
+
+def test_only_metres_can_be_wrong_metres(whole: Capture) -> None:
+    planted = CAMERAS["millimetres"][0](whole)
+    assert causes(replace(planted, metric=False)) == []
+
+
+def test_sizes_that_are_swapped_are_named_and_mended(whole: Capture) -> None:
+    turned = (replace(f, image_size=f.image_size[::-1]) for f in whole.frames.values())
+    planted = replace(whole, frames=Frames.of(turned, whole.path))
+    (found,) = wrong_sizes(planted)
+    assert found.cause is Fault.SIDES_SWAPPED and found.mend is not None
+    mended = found.mend(planted)
+    assert wrong_sizes(mended) == [] and (mended.frames.K == whole.frames.K).all()
+
+
+def test_blurred_broken_and_repeated_images_are_named(whole: Capture) -> None:
+    files = {id: frame.image_path for id, frame in whole.frames.items()}
+    Image.open(files["2"]).filter(ImageFilter.GaussianBlur(3)).save(files["2"], quality=95)
+    Image.open(files["5"]).save(files["6"], quality=98)
+    files["8"].write_bytes(b"no image")
+    found = {finding.cause: finding.frames for finding in look_at_images(whole)}
+    assert found == {
+        Fault.BLURRED: ("2",),
+        Fault.DUPLICATE_FRAMES: ("6",),
+        Fault.IMAGES_UNREADABLE: ("8",),
+    }
