@@ -7,6 +7,7 @@ import numpy as np
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.scaled import scaled
 from deltas_nets.errors import UserError
 
 __all__ = ["in_metres"]
@@ -32,9 +33,8 @@ def in_metres(capture: Capture, unit: float) -> Capture:
     if floats and unit != 1:
         what = f"depth of {len(floats)} frames is in floats of the capture's unit"
         raise UserError(what, str(floats[0].depth_path), "scale the files, or leave depth out")
-    arrays, points, ranges = capture.frames.arrays, capture.points, capture.depth_ranges
-    poses = arrays.cam_from_world.copy()
-    poses[:, :3, 3] *= unit
+    moved = scaled(capture, unit)
+    arrays = moved.frames.arrays
     cameras = tuple(
         camera._replace(
             depth_scale=camera.depth_scale / unit,
@@ -42,14 +42,10 @@ def in_metres(capture: Capture, unit: float) -> Capture:
         )
         for camera in arrays.cameras
     )
-    moved = arrays._replace(cam_from_world=poses, cameras=cameras)
-    return replace(
-        capture,
-        frames=Frames(capture.frames.folder, moved, memory=capture.frames.memory),
-        metric=True,
-        points=None if points is None else points._replace(xyz=points.xyz * unit),
-        depth_ranges=None if ranges is None else ranges * unit,
+    frames = Frames(
+        capture.frames.folder, arrays._replace(cameras=cameras), memory=capture.frames.memory
     )
+    return replace(moved, frames=frames)
 
 
 def _holds_floats(frame: Frame) -> bool:
