@@ -42,6 +42,8 @@ LENSES = {
     "OPENCV": (-0.12, 0.03, 0.001, -0.001),
     "OPENCV_FISHEYE": (0.03, -0.01, 0.004, -0.001),
 }
+LONGER = 1.3
+"""Times the photo's focal length: then every pixel of every lens shows something of the photo."""
 FORMATS = ("colmap", "transforms", "own")
 UNITS = (0.02, 0.27, 5.0, 1000.0)
 Depths = list[NDArray[np.float32]]
@@ -132,18 +134,25 @@ def render(
         frames.append(
             replace(
                 frame, image_path=folder / f"{id}.png", depth_path=folder / f"{id}.depth.png",
-                depth_K=None, depth_size=frame.image_size, lens=lens,
+                K=of_render(frame), depth_K=None, depth_size=frame.image_size, lens=lens,
             )
         )  # fmt: skip
     return replace(capture, path=folder, frames=Frames.of(frames, folder), lost={})
 
 
+def of_render(frame: Frame) -> NDArray[np.float64]:
+    """K of what is rendered of a photo."""
+    K: NDArray[np.float64] = frame.K * [[LONGER, 1, 1], [1, LONGER, 1], [1, 1, 1]]
+    return K
+
+
 def old_pixels(frame: Frame, model: str, coefficients: tuple[float, ...]) -> torch.Tensor:
     """``(H, W, 2)`` where the photo, a pinhole's, has the pixels of another camera with its K."""
-    K = torch.tensor(frame.K)
-    lens = Lens(K, torch.tensor(coefficients, dtype=torch.float64), model)
+    lens = Lens(
+        torch.tensor(of_render(frame)), torch.tensor(coefficients, dtype=torch.float64), model
+    )
     rays = lens.unproject(pixel_grid(frame.image_size, dtype=torch.float64))
-    at = Lens(K, K.new_zeros(0), "PINHOLE").project(rays.rays)
+    at = Lens(torch.tensor(frame.K), torch.zeros(0), "PINHOLE").project(rays.rays)
     known = (rays.valid & at.valid)[:, None]
     return torch.where(known, at.pixels, -9.0).reshape(*frame.image_size, 2)
 
@@ -161,11 +170,14 @@ def seen_by_both(
         within: torch.Tensor = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
         return within.reshape(height, width).numpy()
 
-    K = torch.tensor(other.K)
-    lens = Lens(K, torch.tensor(frame.lens.coefficients, dtype=torch.float64), frame.lens.model)
+    K = torch.tensor(other.K)  # of both
     grid = pixel_grid(frame.image_size, dtype=torch.float64)
-    rays = Lens(K, K.new_zeros(0), "PINHOLE").unproject(grid).rays
-    return inside(old_pixels(other, *frame.lens)), inside(lens.project(rays).pixels)
+    lens = Lens(K, torch.tensor(frame.lens.coefficients, dtype=torch.float64), frame.lens.model)
+    pinhole = Lens(K, K.new_zeros(0), "PINHOLE")
+    return (
+        inside(pinhole.project(lens.unproject(grid).rays).pixels),
+        inside(lens.project(pinhole.unproject(grid).rays).pixels),
+    )
 
 
 if __name__ == "__main__":
