@@ -43,7 +43,10 @@ def cut_points(
         return None
     few = serial_points(tensor)
     whole = _CHUNK // max(1, tensor.shape[:-3].numel())
-    size = few * max(1, round(whole / few)) if parts else few
+    if parts:
+        size = few * max(1, round(whole / few))
+    else:  # more at a time are quicker, where no threads can start
+        size = _CHUNK if torch.get_num_threads() == 1 else few
     count = tensor.shape[-2]
     return Cut(_alike(count, size), (0, *dims), outputs) if count > size else None
 
