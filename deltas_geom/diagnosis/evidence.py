@@ -80,7 +80,7 @@ def choose_pairs(seen: Tensor) -> Tensor:
     return chosen.triu(diagonal=1).nonzero()
 
 
-def residuals(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
+def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHARE) -> Tensor:
     """Distance in px that a quarter of a pair's matches keep within, ``(P)``.
 
     A match is as far off as its pixel in one view is from what that view sees of the other
@@ -91,9 +91,10 @@ def residuals(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
         evidence: of P pairs.
         K: ``(V, 3, 3)`` any invertible matrices, as they may be transposed.
         pose: ``(V, 4, 4)`` cam_from_world.
+        share: of a pair's matches must be within the distance.
     """
     off = _off(evidence, K, pose)
-    return _quantile(torch.maximum(*off.chunk(2)), evidence.counts).clamp(max=CAP)
+    return _quantile(torch.maximum(*off.chunk(2)), evidence.counts, share).clamp(max=CAP)
 
 
 def displacements(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:

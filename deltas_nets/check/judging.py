@@ -13,7 +13,7 @@ from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.depth_camera import unregistered_depth
 from deltas_nets.check.evidence import evidence_of
 from deltas_nets.check.finding import Fault, Finding
-from deltas_nets.check.frames_apart import views_apart
+from deltas_nets.check.frames_apart import MOSTLY, views_apart
 from deltas_nets.check.kinds_of_cameras import wrong_kinds
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import leaving_out
@@ -118,9 +118,10 @@ def _explained(
         return [
             next(s for s in suspects if s.tried.after <= 1.25 * best.tried.after + 0.05).finding
         ]
-    apart = views_apart(evidence, given, len(matched.positions))
+    strict = residuals(evidence, *matched.views(capture.frames), share=MOSTLY)
+    apart = views_apart(evidence, strict, len(matched.positions))
     if apart:
-        return [_apart(capture, matched, evidence, given, apart)]
+        return [_apart(capture, matched, evidence, strict, apart)]
     if level(given) > ENOUGH:
         return [_unexplained(diagnosis, matched, capture)]
     return []

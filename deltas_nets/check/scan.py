@@ -8,9 +8,10 @@ from torch import Tensor
 from deltas_geom.diagnosis.evidence import Evidence, residuals
 from deltas_nets.captures.capture import Capture
 from deltas_nets.check.descriptors import Described, describe
-from deltas_nets.check.frames_apart import views_apart
+from deltas_nets.check.frames_apart import MOSTLY, views_apart
 from deltas_nets.check.matched import LEAST, cameras_of
 from deltas_nets.check.matching import match
+from deltas_nets.check.path import views_off_path
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 
@@ -60,9 +61,12 @@ def scan_frames(
     if not pairs:
         return [], len(positions)
     evidence = _evidence(pairs, matches)
-    residual = residuals(evidence, *cameras_of(capture.frames, positions, sizes))
+    views = cameras_of(capture.frames, positions, sizes)
+    residual = residuals(evidence, *views, share=MOSTLY)
     apart = views_apart(evidence, residual, len(positions), enough=_ENOUGH)
-    return [positions[number] for number in apart], len(positions)
+    poses = capture.frames.cam_from_world[positions]
+    apart += views_off_path(evidence, residual, poses, apart)
+    return [positions[number] for number in sorted(apart)], len(positions)
 
 
 def _look(capture: Capture, network: Deltas, position: int) -> Described | None:

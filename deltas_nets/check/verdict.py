@@ -74,7 +74,7 @@ def check_capture(
     Args:
         capture: as it was read.
         network: whose descriptors match frames; `load_model("deltas-small")`.
-        known: what was found when it was read.
+        known: what was found when it was read, and mended by a guess.
         report: called while frames are matched.
     """
     start = time.monotonic()
@@ -100,10 +100,11 @@ def check_capture(
             _all_apart(readable, network, one) if one.cause is Fault.FRAMES_DISAGREE else one
             for one in more
         ]
-    if guesses:
-        improved, more = improved_guess(guesses[-1], more, readable)
-        found = [improved if one is guesses[-1] else one for one in found]
-    return _checked([*certain, *found, *more], figures, start)
+    told_before = [*certain, *found]
+    for guess in [*known, *guesses][-1:]:
+        improved, more = improved_guess(guess, more, readable)
+        told_before = [improved if one is guess else one for one in told_before]
+    return _checked([*told_before, *more], figures, start)
 
 
 def _checked(findings: list[Finding], figures: Figures, start: float) -> Checked:
