@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["ROOM", "Reach", "end_of_pile", "reach_of", "wider"]
+__all__ = ["ROOM", "Reach", "end_of_pile", "reach_of", "reach_within", "wider"]
 
 ROOM = (0.5, 10.0)
 """Metres that are searched where nothing says otherwise: what the network was trained with."""
@@ -54,9 +54,19 @@ def reach_of(depths: ArrayLike, *, metric: bool) -> Reach:
         Reach(near=40.0, far=800.0, unit=0.0125)
     """
     nearest, median, farthest = (float(d) for d in np.percentile(np.asarray(depths), (2, 50, 98)))
-    unit = 1.0 if metric and AS_IN_ROOMS[0] <= median <= AS_IN_ROOMS[1] else USUAL / median
+    unit = _unit(median, metric)
     near, far = ROOM
     return Reach(min(near / unit, nearest / BEYOND), max(far / unit, farthest * BEYOND), unit)
+
+
+def reach_within(near: float, far: float, *, metric: bool) -> Reach:
+    """A search in a range that is known, in the capture's unit."""
+    return Reach(near, far, _unit(2 / (1 / near + 1 / far), metric))
+
+
+def _unit(median: float, metric: bool) -> float:
+    """Metres that the network takes a unit for where surfaces are typically so far."""
+    return 1.0 if metric and AS_IN_ROOMS[0] <= median <= AS_IN_ROOMS[1] else USUAL / median
 
 
 def end_of_pile(depths: ArrayLike, reach: Reach) -> str | None:

@@ -12,7 +12,7 @@ from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, frames_of
 from deltas_nets.predict.look import found_depths, look
 from deltas_nets.predict.predictor import Predictor
-from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of, wider
+from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of, reach_within, wider
 
 __all__ = ["Asked", "Followed", "Found", "Search"]
 
@@ -69,7 +69,7 @@ class Asked:
 
 
 class Followed:
-    """A search that follows from the capture: from its sparse points, or from a first look.
+    """A search that follows from the capture: its ranges, its sparse points, or a first look.
 
     Where points pile up at an end of that, sensor depth in metres tells more, or a wider look.
 
@@ -86,8 +86,11 @@ class Followed:
         frames = frames_of(self.capture, views)
         metric = self.capture.metric
         position = self._position[views.anchor]
-        points = points_in_view(self.capture, position)
-        if points is not None:
+        points, ranges = points_in_view(self.capture, position), self.capture.depth_ranges
+        if ranges is not None:
+            near, far = map(float, ranges[position])
+            reach, sure = reach_within(near, far, metric=metric), True
+        elif points is not None:
             reach, sure = reach_of(points[:, 2], metric=metric), True
         elif metric:
             reach, sure = Reach(*ROOM), True

@@ -117,6 +117,14 @@ def test_sparse_points_spare_the_first_look(capture: Capture, seen: bool) -> Non
     assert points is not None and np.allclose(points[:, 2], 0.3)
 
 
+def test_a_range_that_the_capture_states_is_searched(capture: Capture) -> None:
+    stated = np.tile([0.2, 0.6], (len(capture.frames), 1))
+    oracle = Oracle(0.3)
+    found = Followed(replace(capture, depth_ranges=stated))(oracle, VIEWS, PredictConfig())
+    assert len(oracle.asked) == 1 and found.reach[:2] == (0.2, 0.6)
+    assert np.allclose(found.map.depth, 0.3)
+
+
 def test_a_sensor_is_asked_where_points_pile_up(capture: Capture) -> None:
     near = scaled(capture, 1.0)  # whose sensor says 2.5 m, and the network 0.3 in vain
     oracle = Oracle(0.3)
