@@ -26,6 +26,7 @@ __all__ = ["unregistered_depth"]
 FACTORS = np.exp(np.linspace(-0.3, 0.3, 25))
 LEAST_CHANGE = 0.05  # relative, of a focal length that is another camera's
 _LEAST_GAIN = 0.95  # of the disagreement is left, at most
+_VALLEY = 0.85  # of the disagreement at either end of the factors
 _PIXELS = 1500  # of a frame, looked at
 _JUMP = 0.08  # of depth, from a pixel to the one after the next: an edge
 _EDGES = 100  # pixels of a frame
@@ -98,7 +99,8 @@ def _by_depth(known: Mapping[int, Sensor], pairs: Sequence[tuple[int, int]]) -> 
         return None
     costs = _Costs(lambda factor: _disagreement(known, pairs, factor))
     best = costs.best()
-    sharp = costs(best) <= _LEAST_GAIN * max(costs(FACTORS[0]), costs(FACTORS[-1]))
+    # Cameras that hardly turn leave a valley without sides.
+    sharp = costs(best) <= _VALLEY * min(costs(FACTORS[0]), costs(FACTORS[-1]))
     if not sharp or (abs(np.log(best)) > LEAST_CHANGE and costs(best) > _LEAST_GAIN * costs(1.0)):
         return None
     return best

@@ -12,7 +12,7 @@ __all__ = ["MOSTLY", "views_apart"]
 MOSTLY = 0.5
 """Of a pair's matches must fit where frames are judged one by one: own matches are that good, and a
 quarter would often fit a frame that was moved."""
-_TIMES = 4.0  # as much as the others' residuals is apart
+_TIMES = 5.0  # as much as the others' residuals is apart
 _SHARE = 0.6  # of a view's pairs
 
 

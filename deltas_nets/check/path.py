@@ -51,7 +51,7 @@ def views_off_path(
 def _jumps(centres: FloatArray) -> NDArray[np.float64]:
     """Distances from the middle of the neighbours, at the ends from the line through the next."""
     inner = centres[1:-1] - (centres[:-2] + centres[2:]) / 2
-    first = centres[0] - 2 * centres[1] + centres[2]
-    last = centres[-1] - 2 * centres[-2] + centres[-3]
+    first = (centres[0] - 2 * centres[1] + centres[2]) / 2
+    last = (centres[-1] - 2 * centres[-2] + centres[-3]) / 2
     jumps: NDArray[np.float64] = np.linalg.norm(np.vstack([first, inner, last]), axis=-1)
     return jumps

@@ -9,6 +9,7 @@ from deltas_nets.check.intrinsics import wrong_intrinsics
 from deltas_nets.check.lenses import wrong_lenses
 from deltas_nets.check.lost import lost_frames
 from deltas_nets.check.places import wrong_places
+from deltas_nets.check.sparse import wrong_points
 
 __all__ = ["TOLD_BEFORE", "quick_findings"]
 
@@ -17,6 +18,7 @@ QUICK: tuple[Callable[[Capture], list[Finding]], ...] = (
     wrong_intrinsics,
     wrong_lenses,
     wrong_places,
+    wrong_points,
     copied_images,
 )
 """One row a check: from a capture to what is wrong with it."""
@@ -30,8 +32,8 @@ def quick_findings(capture: Capture) -> list[Finding]:
     """Findings from files and cameras alone: no pixels, no network.
 
     Lost poses, missing images, intrinsics and lenses that no camera has or that are of other
-    images, cameras that stand still or repeat a pose, poses that are not in metres, copies of one
-    image. A finding of intrinsics may be wrong where photos were cropped; `check_capture` knows
-    more.
+    images, cameras that stand still or repeat a pose, poses that are not in metres, sparse points
+    that contradict cameras, copies of one image. A finding of intrinsics may be wrong where photos
+    were cropped; `check_capture` knows more.
     """
     return [finding for check in QUICK for finding in check(capture)]

@@ -7,7 +7,7 @@ import numpy as np
 
 from deltas_nets.captures.frame import FloatArray, Frame
 
-__all__ = ["of_shape", "of_size", "swapped", "with_K", "with_focal"]
+__all__ = ["moved_centre", "of_shape", "of_size", "swapped", "with_K", "with_focal"]
 
 
 def of_size(K: FloatArray, factor: float) -> FloatArray:
@@ -31,6 +31,13 @@ def with_focal(K: FloatArray, factor: float) -> FloatArray:
     changed = K.copy()
     changed[[0, 1], [0, 1]] *= factor
     return changed
+
+
+def moved_centre(frame: Frame, shift: float) -> Frame:
+    """The frame with its principal point moved, by as much on both axes."""
+    K = frame.K.copy()
+    K[:2, 2] += shift
+    return replace(frame, K=K)
 
 
 def swapped(K: FloatArray) -> FloatArray:

@@ -39,7 +39,7 @@ def intrinsics(change: Callable[[np.ndarray], np.ndarray], every: int = 1) -> Pl
     return frames(lambda i, frame: frame if i % every else replace(frame, K=change(frame.K)))
 
 
-def _scaled(pose: np.ndarray, factor: float) -> np.ndarray:
+def scaled(pose: np.ndarray, factor: float) -> np.ndarray:
     pose[:, :3, 3] *= factor
     return pose
 
@@ -73,8 +73,8 @@ MATCHES: dict[str, tuple[Plant, Fault]] = {
     "inverted": (poses(np.linalg.inv), Fault.POSES_INVERTED),
     "OpenGL": (poses(lambda pose: FLIP @ pose), Fault.OPENGL_AXES),
     "OpenGL, inverted": (poses(lambda pose: np.linalg.inv(FLIP @ pose)), Fault.POSES_INVERTED),
-    "millimetres": (poses(lambda pose: _scaled(pose, 1000)), Fault.NOT_METRES),
-    "another scale": (poses(lambda pose: _scaled(pose, 1.3)), Fault.WRONG_SCALE),
+    "millimetres": (poses(lambda pose: scaled(pose, 1000)), Fault.NOT_METRES),
+    "another scale": (poses(lambda pose: scaled(pose, 1.3)), Fault.WRONG_SCALE),
     "K of half the size": (intrinsics(lambda K: of_size(K, 0.5)), Fault.K_OF_OTHER_SIZE),
     "K times 1.2": (intrinsics(lambda K: of_size(K, 1.2)), Fault.K_OF_OTHER_SIZE),
     "K transposed": (intrinsics(lambda K: K.T.copy()), Fault.K_TRANSPOSED),

@@ -1,21 +1,22 @@
 """What files and cameras tell of a capture before any image is looked at."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from check_plants import CAMERAS
+from check_plants import CAMERAS, frames, poses, scaled
 from conftest import MakeCapture
 from PIL import Image, ImageFilter
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Lens
-from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.check.finding import Fault
 from deltas_nets.check.image_sizes import wrong_sizes
 from deltas_nets.check.images import look_at_images
 from deltas_nets.check.quick import quick_findings
+from deltas_nets.check.rewrite import moved_centre
 
 
 @pytest.fixture
@@ -64,8 +65,8 @@ def test_lost_poses_are_named_by_frame(make_capture: MakeCapture) -> None:
     "lens", [Lens("OPENCV", (0.26, -0.95, -0.005, 0.003)), Lens("SIMPLE_RADIAL", (-0.3,))]
 )
 def test_lenses_that_there_are_raise_no_alarm(lens: Lens, whole: Capture) -> None:
-    frames = Frames.of((replace(f, lens=lens) for f in whole.frames.values()), whole.path)
-    assert causes(replace(whole, frames=frames)) == []
+    lenses = frames(lambda _, frame: replace(frame, lens=lens))
+    assert causes(lenses(whole)) == []
 
 
 def test_only_metres_can_be_wrong_metres(whole: Capture) -> None:
@@ -74,8 +75,7 @@ def test_only_metres_can_be_wrong_metres(whole: Capture) -> None:
 
 
 def test_sizes_that_are_swapped_are_named_and_mended(whole: Capture) -> None:
-    turned = (replace(f, image_size=f.image_size[::-1]) for f in whole.frames.values())
-    planted = replace(whole, frames=Frames.of(turned, whole.path))
+    planted = frames(lambda _, f: replace(f, image_size=f.image_size[::-1]))(whole)
     (found,) = wrong_sizes(planted)
     assert found.cause is Fault.SIDES_SWAPPED and found.mend is not None
     mended = found.mend(planted)
@@ -93,3 +93,18 @@ def test_blurred_broken_and_repeated_images_are_named(whole: Capture) -> None:
         Fault.DUPLICATE_FRAMES: ("6",),
         Fault.IMAGES_UNREADABLE: ("8",),
     }
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["colmap_text", "colmap_text_kapture", "openmvg", "opensfm"])
+def test_sparse_points_tell_of_half_a_pixel_and_of_scale(name: str, shared_data: Path) -> None:
+    capture = open_capture(shared_data / "formats" / name)
+    assert quick_findings(capture) == []
+    for plant, cause in (
+        (frames(lambda _, frame: moved_centre(frame, 0.5)), Fault.HALF_A_PIXEL),
+        (poses(lambda pose: scaled(pose, 3.7)), Fault.WRONG_SCALE),
+    ):
+        planted = plant(capture)
+        (found,) = quick_findings(planted)
+        assert found.cause is cause and found.mend is not None
+        assert quick_findings(found.mend(planted)) == []
