@@ -74,7 +74,7 @@ def recomputed(
         return function(*tensors)
     values = function if values is None else values
     compiling = torch.compiler.is_compiling()
-    if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)):
+    if not differentiated(*tensors):
         with torch.no_grad():
             return _by_chunks(values, cut, *tensors)
     kind = _Traced if compiling else _Recomputed
@@ -87,6 +87,11 @@ def _by_chunks(function: Function, cut: Cut | None, *tensors: Tensor | None) -> 
         return function(*tensors)
     parts = [function(*some) for some in chunks(cut, tensors, cut.inputs)]
     return tuple(map(joined, zip(*parts, strict=True), cut.outputs))
+
+
+def differentiated(*tensors: Tensor | None) -> bool:
+    """Will a backward pass be possible?"""
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
 def transformed(*tensors: Tensor | None) -> bool:

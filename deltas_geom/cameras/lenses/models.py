@@ -25,6 +25,7 @@ class Model(NamedTuple):
         rays: from coefficients, the reach, a place on the plane and whether a gradient is wanted:
             the unit ray, and whether.
         reach: from coefficients, how far the model is one to one, ``(*B, R)``.
+        around_axis: do rays turn with their pixels around the axis?
     """
 
     coefficients: tuple[str, ...]
@@ -32,6 +33,7 @@ class Model(NamedTuple):
     pixels: Callable[[Coefficients, Tensor, Tensor, Tensor, Tensor], Seen]
     rays: Callable[[Coefficients, Tensor, Tensor, Tensor, bool], Direction]
     reach: Callable[[Coefficients], Tensor] | None = None
+    around_axis: bool = True
 
 
 def _closed(
@@ -52,11 +54,13 @@ def _closed(
         focals,
         lambda coefficients, _, x, y, z: pixels(coefficients, x, y, z),
         rays_of_length_one,
+        around_axis=pixels is not closed.panorama_pixels,
     )
 
 
 def _polynomial(names: str, focals: int, kind: Polynomial) -> Model:
-    return Model(tuple(names.split()), focals, kind.pixels, kind.rays, kind.reach)
+    parts = (kind.pixels, kind.rays, kind.reach, kind.around_axis)
+    return Model(tuple(names.split()), focals, *parts)
 
 
 def _slopes(names: str, focals: int = 2, /, **kinds: str) -> Model:
@@ -100,6 +104,7 @@ MODELS: dict[str, Model] = {
         prism_of_aria.pixels,
         prism_of_aria.rays,
         prism_of_aria.reach,
+        around_axis=False,
     ),
     "EQUIRECTANGULAR": _closed("", 2, closed.panorama_pixels, closed.panorama_rays),
 }

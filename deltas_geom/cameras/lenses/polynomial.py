@@ -38,6 +38,11 @@ class Polynomial(NamedTuple):
             angles, **{kind: tuple(place[n] for n in of.split()) for kind, of in kinds.items()}
         )
 
+    @property
+    def around_axis(self) -> bool:
+        """As :attr:`Model.around_axis`."""
+        return not self.tangential and not self.prism
+
     def terms(self, coefficients: Coefficients) -> Terms:
         """The terms of these coefficients."""
         parts = [tuple(coefficients[k] for k in places) for places in self[1:]]

@@ -143,7 +143,8 @@ def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
     steepness = _product(above, below)
     for i, a in enumerate(above):
         for k, b in enumerate(below):
-            steepness[i + k] = steepness[i + k] + 2 * (i - k) * a * b
+            if i != k:
+                steepness[i + k] = torch.addcmul(steepness[i + k], a, b, value=2 * (i - k))
     of_r = [part for each in steepness for part in (each, torch.zeros_like(one))][:-1]
     if not terms.only_radial:
         taken = [torch.zeros_like(one) for _ in range(4)]
@@ -179,6 +180,8 @@ def image_radius(terms: Terms, within: Tensor) -> Tensor:
 
 
 def _product(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
+    if len(b) == 1:
+        return [b[0] * each for each in a]
     found: list[Tensor] = [torch.zeros_like(a[0] * b[0]) for _ in range(len(a) + len(b) - 1)]
     for i, first in enumerate(a):
         for k, second in enumerate(b):

@@ -6,6 +6,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.lenses.many import MANY, by_chunks, rays_around_axis
 from deltas_geom.cameras.lenses.models import MODELS
 from deltas_geom.cameras.views import finite_intrinsics
 from deltas_geom.checks import batch_shape, check_shapes
@@ -14,11 +15,13 @@ from deltas_geom.numerics.arithmetic import (
     only,
     promoted,
     solver_dtype,
+    surely_below,
     unless_all,
+    values_at_hand,
     without_autocast,
 )
 from deltas_geom.numerics.chunks import Cut
-from deltas_geom.numerics.evaluation import recomputed
+from deltas_geom.numerics.evaluation import differentiated, recomputed
 
 _LARGEST = 1e30  # of a coefficient, or a pixel in focal lengths
 _FAR = 1e60  # of a coordinate
@@ -31,20 +34,28 @@ _Both = tuple[Tensor, Tensor]
 def pixels_of_points(K: Tensor, coefficients: Tensor, points: Tensor, model: str) -> _Both:
     """Pixels of points in the camera's frame through a model, and which are valid."""
     check_shapes(points=(points, "N 3"))
-    return _through(partial(_pixels, model), model, K, coefficients, points)
+    return _through(partial(_pixels, model), model, K, coefficients, points, None)
 
 
 @without_autocast
 def rays_of_pixels(K: Tensor, coefficients: Tensor, pixels: Tensor, model: str) -> _Both:
     """Rays of pixels, and which are valid."""
     check_shapes(pixels=(pixels, "N 2"))
-    return _through(partial(_rays, model), model, K, coefficients, pixels)
+    return _through(partial(_rays, model), model, K, coefficients, pixels, _rays_of_many)
 
 
 def _through(
-    function: Callable[..., _Both], model: str, K: Tensor, coefficients: Tensor, items: Tensor
+    function: Callable[..., _Both],
+    model: str,
+    K: Tensor,
+    coefficients: Tensor,
+    items: Tensor,
+    prepare: Callable[..., Callable[..., _Both] | None] | None,
 ) -> _Both:
-    """``function`` of cleaned cameras and some items at a time, in the solver's type."""
+    """``function`` of cleaned cameras and some items at a time, in the solver's type.
+
+    Many items of one lens are looked at first: ``prepare`` may find a faster way for their values.
+    """
     batch = batch_shape(K.shape[:-2], coefficients.shape[:-1], items.shape[:-2])
     K, coefficients, items = promoted(K, coefficients, items)
     dtype = solver_dtype(items)
@@ -56,13 +67,14 @@ def _through(
     reach = _reach(model, coefficients.detach())
     few = max(256, _CACHED // max(1, batch.numel()))
     apart = items.shape[-2] > few and not torch.compiler.is_compiling()
+    values, inputs = None, (K, coefficients, reach, items)
+    if prepare is not None and known is None and batch.numel() * items.shape[-2] >= MANY:
+        values = prepare(model, *inputs)
+        apart = apart and (values is None or differentiated(*inputs))
     found, valid = recomputed(
         partial(function, True),
-        K,
-        coefficients,
-        reach,
-        items,
-        values=partial(function, False),
+        *inputs,
+        values=values or partial(function, False),
         cut=Cut(few, (0, 0, 0, -2), (-2, -1)) if apart else None,
     )
     if known is not None or sound is not None:
@@ -71,6 +83,23 @@ def _through(
         masks = (None if mask is None else mask.squeeze(-1) for mask in (known, sound))
         valid = only(valid, *masks, other=False)
     return found.expand(*batch, *found.shape[-2:]), valid.expand(*batch, valid.shape[-1])
+
+
+def _rays_of_many(
+    model: str, K: Tensor, coefficients: Tensor, reach: Tensor, pixels: Tensor
+) -> Callable[..., _Both] | None:
+    """The values of :func:`_rays` by what is found once for all pixels of one lens."""
+    one = K.numel() == 9 and coefficients.shape[:-1].numel() == 1
+    if not one or not all(map(values_at_hand, (K, coefficients, pixels))):
+        return None
+    K, coefficients = K.detach().reshape(3, 3), coefficients.detach().flatten()
+    plain = partial(_rays, model, False, K, coefficients, reach.flatten())
+    if not MODELS[model].around_axis:
+        return lambda *given: by_chunks(plain, given[-1])
+    parts = (_terms(coefficients), reach.flatten(), pixels, plain)
+    with torch.no_grad():
+        found = rays_around_axis(MODELS[model], K, *parts)
+    return None if found is None else lambda *given: found(given[-1])
 
 
 def _terms(coefficients: Tensor) -> Sequence[Tensor]:
@@ -101,7 +130,12 @@ def _pixels(
 
 
 def _rays(
-    model: str, derivable: bool, K: Tensor, coefficients: Tensor, reach: Tensor, pixels: Tensor
+    model: str,
+    derivable: bool,
+    K: Tensor,
+    coefficients: Tensor,
+    reach: Tensor,
+    pixels: Tensor,
 ) -> _Both:
     # Beyond that many px a float64 knows no pixel, nor its square.
     xy, finite = finite_or_zero(pixels.to(K.dtype), limit=_LARGEST)
@@ -110,8 +144,9 @@ def _rays(
     x, y = xy.unbind(dim=-1)
     v = (y - cy) / fy
     u = torch.addcmul(x - cx, skew, v, value=-1) / fx
-    near = torch.maximum(u.detach().abs(), v.detach().abs()) < _LARGEST
-    small = unless_all(near)
+    small = None
+    if not (surely_below(u, _LARGEST) and surely_below(v, _LARGEST)):
+        small = torch.maximum(u.detach().abs(), v.detach().abs()) < _LARGEST
     u, v = only(u, small), only(v, small)
     *ray, valid = MODELS[model].rays(_terms(coefficients), reach, u, v, derivable)
     valid = only(valid, small, finite if finite is None else finite.squeeze(-1), other=False)

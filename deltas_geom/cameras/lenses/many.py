@@ -1,0 +1,178 @@
+"""Rays of very many pixels of one lens that bends all pixels of a circle alike.
+
+Such a ray depends on the distance from the centre alone, but for its turn around the axis. With b
+the tangent of half of its angle from the axis, divided by that distance, it is
+
+.. math:: (2bu, 2bv, 1 - m) / (1 + m), \\quad m = b^2 (u^2 + v^2)
+
+of length 1 to rounding, in front of the lens and behind it; b is read from a table that the model's
+own rays make. Everything else is a few passes over numbers that stay in the cache, in NumPy, whose
+passes take half of torch's time. What the table does not hold is left to the model.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from deltas_geom.cameras.lenses.closed import Coefficients
+from deltas_geom.cameras.lenses.models import Model
+from deltas_geom.cameras.lenses.tables import Table, table_of
+
+Array = NDArray[Any]
+MANY = 32768
+"""Pixels from which on a table is worth being made."""
+_CHUNK = 16384
+_SAMPLED = 512  # pixels, for how far the table goes
+_TOLERANCE = 1e-14
+_Rays = tuple[Tensor, Tensor]
+
+
+class RaysOfMany(NamedTuple):
+    """A function of pixels.
+
+    Attributes:
+        K: ``(3, 3)``.
+        table: of b by the squared radius in px along x.
+        others: rays ``(N, 3)`` and whether ``(N,)`` of pixels ``(N, 2)`` by the model itself.
+    """
+
+    K: Array
+    table: Table
+    others: Callable[[Tensor], _Rays]
+
+    def __call__(self, pixels: Tensor) -> _Rays:
+        """Rays ``(*B, N, 3)`` of pixels ``(*B, N, 2)``, and which are valid ``(*B, N)``."""
+        buffers = _Buffers.of(min(_CHUNK, pixels.shape[:-1].numel()))
+        with np.errstate(all="ignore"):
+            return _filled(partial(self._some, buffers), pixels)
+
+    def _some(self, buffers: "_Buffers", pixels: Tensor, rays: Tensor, valid: Tensor) -> None:
+        u, v, s, b, place, work, whole = buffers.first(len(pixels))
+        to_plane(self.K, pixels.numpy(), u, v)
+        np.multiply(u, u, out=s)
+        np.multiply(v, v, out=work)
+        np.add(s, work, out=s)
+        self.table.read(s, place, whole, work, out=b)
+        known = valid.numpy()
+        # The largest of numbers and NaN is NaN, which is not below.
+        if s.max() < self.table.exact:
+            known[:] = True
+        else:
+            np.less(s, self.table.exact, out=known)
+        out = rays.numpy()
+        np.multiply(b, b, out=work)
+        np.multiply(work, s, out=work)
+        np.add(work, 1.0, out=work)
+        np.divide(2.0, work, out=work)
+        np.subtract(work, 1.0, out=out[:, 2], casting="same_kind")
+        np.multiply(b, work, out=b)
+        np.multiply(u, b, out=out[:, 0], casting="same_kind")
+        np.multiply(v, b, out=out[:, 1], casting="same_kind")
+        if not known.all():
+            rays[~valid] = 0.0
+            # Beyond the end of the model there is no ray to look for.
+            left = torch.from_numpy(np.flatnonzero(~known & ~(s >= self.table.ends)))
+            rays[left], valid[left] = self.others(pixels[left])
+
+
+def by_chunks(function: Callable[[Tensor], _Rays], pixels: Tensor) -> _Rays:
+    """The function's rays and masks, some pixels at a time."""
+
+    def some(pixels: Tensor, rays: Tensor, valid: Tensor) -> None:
+        rays[:], valid[:] = function(pixels)
+
+    return _filled(some, pixels)
+
+
+def _filled(some: Callable[[Tensor, Tensor, Tensor], None], pixels: Tensor) -> _Rays:
+    """What is written for some pixels at a time; to join parts would take longer than all else."""
+    flat = pixels.detach().reshape(-1, 2)
+    rays, valid = flat.new_empty(len(flat), 3), flat.new_empty(len(flat), dtype=torch.bool)
+    for start in range(0, len(flat), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        some(flat[part], rays[part], valid[part])
+    return rays.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
+
+
+class _Buffers(NamedTuple):
+    """What lies between pixels and rays; it stays in the cache."""
+
+    u: Array
+    v: Array
+    s: Array
+    b: Array
+    place: Array
+    work: Array
+    whole: Array
+
+    @classmethod
+    def of(cls, count: int) -> "_Buffers":
+        """For so many pixels."""
+        u, v, s, b, place, work = (np.empty(count) for _ in range(6))
+        return cls(u, v, s, b, place, work, np.empty(count, dtype=np.intp))
+
+    def first(self, count: int) -> "_Buffers":
+        """For fewer pixels."""
+        return self if count == len(self.u) else type(self)(*(each[:count] for each in self))
+
+
+def to_plane(K: Array, pixels: Array, u: Array, v: Array) -> None:
+    """Pixels ``(N, 2)`` on the plane of the lens, as far apart as along x, into ``u``, ``v``."""
+    (fx, skew, cx), (_, fy, cy), _ = K
+    np.subtract(pixels[:, 0], cx, out=u)
+    np.subtract(pixels[:, 1], cy, out=v)
+    if skew:
+        np.subtract(u, skew / fy * v, out=u)
+    if fx != fy:
+        np.multiply(v, fx / fy, out=v)
+
+
+def sampled_end(K: Array, pixels: Tensor) -> float:
+    """A squared radius on the plane that few pixels exceed."""
+    flat = pixels.detach().reshape(-1, 2)
+    some = flat[:: max(1, len(flat) // _SAMPLED)].numpy()
+    u, v = np.empty(len(some)), np.empty(len(some))
+    with np.errstate(all="ignore"):
+        to_plane(K, some, u, v)
+        squared = u * u + v * v
+    # Sorting puts NaN last. One pixel far away must not make the table coarse for all others.
+    return 1.3 * float(np.sort(squared)[int(0.98 * (len(some) - 1))])
+
+
+def rays_around_axis(
+    model: Model,
+    K: Tensor,
+    coefficients: Coefficients,
+    reach: Tensor,
+    pixels: Tensor,
+    others: Callable[[Tensor], _Rays],
+) -> RaysOfMany | None:
+    """The function of pixels, if there is a table for most of them.
+
+    Args:
+        model: whose rays turn with their pixels around the axis.
+        K: ``(3, 3)``, finite.
+        coefficients: each ``(1,)``.
+        reach: ``(R,)`` of the model.
+        pixels: ``(*B, N, 2)``, of which some tell how far the table goes.
+        others: rays of pixels that the table does not hold.
+    """
+    plain = K.numpy()
+    focal = float(plain[0, 0])
+
+    def half_tangents(squared: Array) -> tuple[Array, Array]:
+        u = torch.from_numpy(np.sqrt(squared) / focal)
+        x, _, z, known = model.rays(coefficients, reach, u, torch.zeros_like(u), False)
+        return (x / ((1 + z) * u * focal)).numpy(), known.numpy()
+
+    end = sampled_end(plain, pixels)
+    if not 0 < end < 1e24:
+        return None
+    with np.errstate(all="ignore"):
+        table = table_of(half_tangents, end, _TOLERANCE)
+    return None if table is None else RaysOfMany(plain, table, others)
