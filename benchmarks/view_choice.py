@@ -33,7 +33,8 @@ def main() -> None:
     network, config = load_predictor("deltas-small"), PredictConfig()
     ways = {"chosen": choose_view_sets(capture, num_views, anchors=anchors)}
     ways |= {f"gap {gap}": at_gap(capture, anchors, gap, num_views - 1) for gap in GAPS}
-    print(f"{capture.path.name}, {num_views} views, {len(anchors)} anchors: Abs Rel, delta < 1.25")
+    print(f"{capture.path.name}, {num_views} views, {len(anchors)} anchors")
+    print("  Abs Rel: mean, median; delta < 1.25")
     for name, sets in ways.items():
         found = [
             depth_metrics(
@@ -44,7 +45,7 @@ def main() -> None:
         ]
         scores = [score for score in found if score is not None]
         errors, inside = ([getattr(s, key) for s in scores] for key in ("abs_rel", "delta1"))
-        print(f"  {name:<8} {np.mean(errors):.4f}  {np.mean(inside):.3f}")
+        print(f"  {name:<8} {np.mean(errors):.4f}  {np.median(errors):.4f}  {np.mean(inside):.3f}")
 
 
 def at_gap(capture: Capture, anchors: Sequence[str], gap: int, count: int) -> tuple[ViewSet, ...]:
