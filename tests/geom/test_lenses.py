@@ -7,17 +7,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lens_cases import CASES, TURNING, Case, pixels_of, seen_from_the_axis
+from lens_cases import CASES, TURNING, Array, Case, on_plane, pixels_of, seen_from_the_axis
 from torch import Tensor
 from torch.testing import assert_close
 
 import deltas_geom as geom
 from deltas_geom import Lens
+from deltas_geom.cameras.lenses.many import MANY
+from deltas_geom.cameras.lenses.tables import table_of
 from deltas_geom.testing.strategies import vectors
 
 ALL = CASES | TURNING
 EACH = pytest.mark.parametrize("name", ALL)
 SLOPES = {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_THIN_PRISM"}
+ANGLES = {"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"}
 MODELS = pytest.mark.parametrize("model", CASES)
 
 
@@ -90,11 +93,83 @@ def test_a_point_comes_back_as_its_own_ray_or_is_masked(
     assert_close(torch.where(both, rays, wanted), wanted, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if ALL[name].model in SLOPES])
+@pytest.mark.parametrize("name", [n for n in ALL if ALL[n].model in SLOPES | ANGLES])
 def test_the_mask_is_the_domain_that_can_be_seen_from_the_axis(name: str) -> None:
     case, pixels = ALL[name], pixels_of(4000)
     found = case.lens().unproject(pixels).valid.numpy()
     assert np.mean(found == seen_from_the_axis(case, pixels)) >= 0.999
+
+
+@EACH
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_many_pixels_have_the_rays_that_few_have(name: str, dtype: torch.dtype) -> None:
+    lens, pixels = ALL[name].lens(dtype), pixels_of(MANY + 1000).to(dtype)
+    odd = torch.tensor([[math.nan, 0], [math.inf, 1], [1e20, 1e20], [-9e3, 4e3], [655, 470]])
+    pixels[100:105] = odd.to(dtype)
+    rays, valid = lens.unproject(pixels)
+    few = [lens.unproject(some) for some in pixels.split(MANY // 2)]
+    assert torch.equal(valid, torch.cat([part.valid for part in few]))
+    error = 1e-12 if dtype == torch.float64 else 1.2e-7
+    assert_close(rays, torch.cat([part.rays for part in few]), rtol=0, atol=error)
+
+
+@pytest.mark.parametrize("name", ["OPENCV_FISHEYE", "barrel", "OPENCV"])
+def test_many_pixels_have_the_derivatives_that_few_have(name: str) -> None:
+    lens, pixels = ALL[name].lens(), pixels_of(MANY).reshape(2, -1, 2)
+    weights = torch.linspace(-1, 1, 3).double()
+    given = [t.clone().requires_grad_() for t in (lens.K, lens.coefficients, pixels)]
+    through = Lens(given[0], given[1], lens.model)
+    many = torch.autograd.grad((through.unproject(given[2]).rays * weights).sum(), given)
+    parts = [(through.unproject(row).rays * weights).sum() for row in given[2]]
+    assert_close(many, torch.autograd.grad(sum(parts[1:], parts[0]), given), rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=15)
+@given(k=vectors(1, within=0.1, size=4))
+def test_a_fisheye_sees_as_far_as_its_radius_grows(k: Tensor) -> None:
+    lens = Lens(CASES["OPENCV_FISHEYE"].lens().K, k[0], "OPENCV_FISHEYE")
+    pixels = pixels_of(MANY + 1)
+    angle = np.linspace(0, np.pi, 400_001)
+    radius = angle * (1 + sum(c * angle ** (2 * i + 2) for i, c in enumerate(k[0].tolist())))
+    falls = np.diff(radius) <= 0
+    farthest = radius[falls.argmax()] if falls.any() else radius[-1]
+    distance = np.linalg.norm(on_plane(lens, pixels), axis=-1)
+    seen = lens.unproject(pixels).valid.numpy()
+    assert np.mean(seen == (distance < farthest)) > 0.999
+    rays = lens.unproject(pixels).rays[torch.from_numpy(seen)].numpy()
+    found = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    turns = falls.argmax() if falls.any() else len(angle) - 1
+    exact = np.interp(distance[seen], radius[: turns + 1], angle[: turns + 1])
+    inner = distance[seen] < 0.9 * farthest
+    assert np.abs(found - exact)[inner].max(initial=0.0) < 1e-8
+
+
+def test_a_table_is_read_where_it_is_exact_and_nowhere_else() -> None:
+    def function(s: Array) -> tuple[Array, Array]:
+        return np.exp(-s) + np.where(s > 0.7, s - 0.7, 0), s < 0.9
+
+    table = table_of(function, 1.0, 1e-13)
+    assert table is not None
+    assert 0.6 < table.exact <= 0.7 and 0.85 < table.ends <= 0.95
+    s = np.linspace(0, table.exact, 10_001)[:-1]
+    place, work, out = np.empty((3, len(s)))
+    table.read(s, place, np.empty(len(s), np.intp), work, out)
+    assert np.abs(out - np.exp(-s)).max() < 3e-16
+    assert table_of(lambda s: (np.abs(s - 0.01), s < 9), 1.0, 1e-13) is None
+    assert table_of(lambda s: (s * np.nan, s < 0), 1.0, 1e-13) is None
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "FOV", "THIN_PRISM_FISHEYE"])
+def test_a_compiled_lens_is_the_same(model: str) -> None:
+    lens = CASES[model].lens()
+    points = 2 * lens.unproject(pixels_of(60)).rays
+
+    def project(K: Tensor, coefficients: Tensor, points: Tensor) -> tuple[Tensor, ...]:
+        return tuple(Lens(K, coefficients, model).project(points))
+
+    compiled = torch.compile(project, fullgraph=True, backend="aot_eager")
+    given = lens.K, lens.coefficients, points
+    assert_close(compiled(*given), project(*given), rtol=0, atol=1e-9)
 
 
 @MODELS

@@ -28,7 +28,7 @@ MANY = 32768
 """Pixels from which on a table is worth being made."""
 _CHUNK = 16384
 _SAMPLED = 512  # pixels, for how far the table goes
-_TOLERANCE = 1e-14
+_TOLERANCE = 1e-13
 _Rays = tuple[Tensor, Tensor]
 
 

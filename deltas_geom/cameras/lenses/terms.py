@@ -38,7 +38,7 @@ class Terms(NamedTuple):
     @property
     def only_radial(self) -> bool:
         """Are there no other terms than those of the gain?"""
-        return not self.tangential and not self.prism
+        return len(self.tangential) + len(self.prism) == 0  # a compiler knows no "not" of tuples
 
 
 class Jacobian(NamedTuple):
