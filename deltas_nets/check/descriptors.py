@@ -24,12 +24,14 @@ class Described(NamedTuple):
         size: (height, width) it was looked at.
         keypoints: ``(N, 2)`` px of that size.
         fine: ``(D, h, w)`` descriptors of unit length at half that size.
+        rows: ``(h w, D)`` the same in another order, which is quicker to gather from.
         coarse: ``(D, h/2, w/2)`` of unit length at a quarter.
     """
 
     size: tuple[int, int]
     keypoints: Tensor
     fine: Tensor
+    rows: Tensor
     coarse: Tensor
 
     def at(self, pixels: Tensor) -> Tensor:
@@ -66,4 +68,5 @@ def describe(
     keypoints = network.detector(encoded.features, image_size=size, num_keypoints=num_keypoints)
     fine = encoded.descriptors.maps[0, 0]
     coarse = F.normalize(F.avg_pool2d(fine[None], 2)[0], dim=0)
-    return Described(size, keypoints.pixels[0], fine, coarse)
+    rows = fine.flatten(1).mT.contiguous()
+    return Described(size, keypoints.pixels[0], fine, rows, coarse)

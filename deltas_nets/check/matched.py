@@ -14,6 +14,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.straight import straight
 from deltas_nets.check.descriptors import Described, describe
 from deltas_nets.check.matching import match
+from deltas_nets.check.workers import side_by_side
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 
@@ -68,6 +69,7 @@ def match_capture(
     network: Deltas,
     *,
     groups: int = GROUPS,
+    threads: int = 1,
     report: Callable[[str], None] = lambda _: None,
 ) -> Matched:
     """Match frames to their neighbours in time, at about ``groups`` places of a capture.
@@ -79,16 +81,15 @@ def match_capture(
         capture: two frames or more.
         network: with descriptors.
         groups: how many places.
+        threads: that look at places.
         report: called with the id of every anchor when it is done.
     """
     looked = _Looked(capture.frames, network)
+    anchors = _spread(len(capture.frames), groups)
     rows: list[dict[int, Tensor]] = []
-    for anchor in _spread(len(capture.frames), groups):
-        if looked(anchor) is None:
-            continue
-        found = _group(capture, looked, anchor)
-        if found:
-            rows.append(found)
+    found_in = side_by_side(lambda anchor: _group(capture, looked, anchor), anchors, threads)
+    for anchor, found in zip(anchors, found_in, strict=True):
+        rows += [found] if found else []
         report(capture.frames.id_at(anchor))
     return _joined(looked, rows)
 
@@ -103,11 +104,12 @@ class _Looked:
 
     def __call__(self, position: int) -> Described | None:
         if position not in self.known:
-            self.known[position] = None
+            # Two threads may look at the same; neither must see that the other has only begun.
             try:
-                self.known[position] = describe(self.network, self.frames.at(position))
+                described = describe(self.network, self.frames.at(position))
             except UserError as error:
-                self.unread[position] = error
+                self.unread[position], described = error, None
+            self.known[position] = described
         return self.known[position]
 
 
@@ -120,7 +122,8 @@ def _spread(count: int, groups: int) -> list[int]:
 def _group(capture: Capture, looked: _Looked, anchor: int) -> dict[int, Tensor]:
     """Pixels ``(N, 2)`` of the anchor's keypoints in each frame of its group, NaN if not seen."""
     first = looked(anchor)
-    assert first is not None
+    if first is None:
+        return {}
     found: dict[int, Tensor] = {anchor: first.keypoints.double()}
 
     def moved(position: int) -> float | None:

@@ -50,13 +50,12 @@ def _find(descriptors: Tensor, image: Described) -> tuple[Tensor, Tensor]:
 
 def _refined(descriptors: Tensor, image: Described, row: Tensor, column: Tensor) -> Tensor:
     """The best of 8 x 8 descriptors around a place, to a part of a pixel."""
-    dim, rows, columns = image.fine.shape
+    _, rows, columns = image.fine.shape
     window = torch.arange(-3, 5, device=row.device)
     near_rows = (row[:, None] + window).clamp(0, rows - 1)
     near_columns = (column[:, None] + window).clamp(0, columns - 1)
     flat = (near_rows[:, :, None] * columns + near_columns[:, None, :]).flatten(1)
-    near = image.fine.flatten(1)[:, flat.flatten()].reshape(dim, *flat.shape)
-    alike = torch.einsum("nd,dnk->nk", descriptors, near)
+    alike = (image.rows[flat] @ descriptors[:, :, None])[..., 0]
     place = alike.argmax(dim=-1)
     which = torch.arange(len(row), device=row.device)
     y, x = place // 8, place % 8

@@ -1,7 +1,5 @@
 """Every frame matched to those after it, small: which ones disagree, once some are known to."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -12,6 +10,7 @@ from deltas_nets.check.frames_apart import MOSTLY, views_apart
 from deltas_nets.check.matched import LEAST, cameras_of
 from deltas_nets.check.matching import match
 from deltas_nets.check.path import views_off_path
+from deltas_nets.check.workers import side_by_side
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 
@@ -25,9 +24,7 @@ _ENOUGH = 1.2  # px at that size
 _STEPS = (1, 2)  # frames on, to match
 
 
-def scan_frames(
-    capture: Capture, network: Deltas, *, report: Callable[[str], None] = lambda _: None
-) -> tuple[list[int], int]:
+def scan_frames(capture: Capture, network: Deltas, *, threads: int = 1) -> tuple[list[int], int]:
     """Positions of the frames that disagree with their neighbours, and how many were looked at.
 
     A frame in the wrong place by a hand's breadth shows at a fourth of the pixels as well, and all
@@ -36,15 +33,15 @@ def scan_frames(
     Args:
         capture: whose other frames agree.
         network: with descriptors.
-        report: called with the id of every frame that was looked at.
+        threads: that look at frames.
     """
     positions = list(range(0, len(capture.frames), -(-len(capture.frames) // MOST)))
     known: list[Described | None] = []
     sizes: list[tuple[int, int]] = []
     pairs: list[tuple[int, int]] = []
     matches: list[Tensor] = []
-    for number, position in enumerate(positions):
-        described = _look(capture, network, position)
+    looked = side_by_side(lambda position: _look(capture, network, position), positions, threads)
+    for number, described in enumerate(looked):
         known.append(described)
         sizes.append((1, 1) if described is None else described.size)
         for step in _STEPS:
@@ -57,7 +54,6 @@ def scan_frames(
                 matches.append(torch.stack([one.keypoints[kept], there[kept]]).double().cpu())
         if number >= max(_STEPS):
             known[number - max(_STEPS)] = None  # its descriptors are not needed any more
-        report(capture.frames.id_at(position))
     if not pairs:
         return [], len(positions)
     evidence = _evidence(pairs, matches)

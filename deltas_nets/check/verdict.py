@@ -67,6 +67,7 @@ def check_capture(
     network: Deltas,
     *,
     known: Sequence[Finding] = (),
+    threads: int = 1,
     report: Callable[[str], None] = lambda _: None,
 ) -> Checked:
     """Find out what is wrong with a capture.
@@ -75,6 +76,7 @@ def check_capture(
         capture: as it was read.
         network: whose descriptors match frames; `load_model("deltas-small")`.
         known: what was found when it was read, and mended by a guess.
+        threads: that look at frames, each computing alone: frames are small.
         report: called while frames are matched.
     """
     start = time.monotonic()
@@ -88,7 +90,7 @@ def check_capture(
     guesses = [finding for finding in found if finding.cause in GUESSED]
     for guess in guesses:
         readable = readable if guess.mend is None else guess.mend(readable)
-    matched = match_capture(readable, network, report=report)
+    matched = match_capture(readable, network, threads=threads, report=report)
     more, figures = judge_matches(readable, matched)
     if figures.pairs:
         told = {*OVERRULED, *(one.cause for one in more)}
@@ -97,7 +99,9 @@ def check_capture(
         found = [one for one in found if one.cause not in told]
     if figures.looked_at < len(readable.frames):
         more = [
-            _all_apart(readable, network, one) if one.cause is Fault.FRAMES_DISAGREE else one
+            _all_apart(readable, network, one, threads)
+            if one.cause is Fault.FRAMES_DISAGREE
+            else one
             for one in more
         ]
     told_before = [*certain, *found]
@@ -114,9 +118,9 @@ def _checked(findings: list[Finding], figures: Figures, start: float) -> Checked
     return Checked(tuple(ordered), figures._replace(seconds=time.monotonic() - start))
 
 
-def _all_apart(capture: Capture, network: Deltas, found: Finding) -> Finding:
+def _all_apart(capture: Capture, network: Deltas, found: Finding, threads: int) -> Finding:
     """The finding with all frames that disagree, of those looked at or not."""
-    apart, looked = scan_frames(capture, network)
+    apart, looked = scan_frames(capture, network, threads=threads)
     ids = set(found.frames) | {capture.frames.id_at(position) for position in apart}
     if len(ids) == len(found.frames):
         return found

@@ -10,6 +10,8 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
 
+MOST_THREADS = 4
+
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
     from deltas_nets.check.finding import Finding
@@ -45,6 +47,8 @@ class Check(Command):
 
     def run(self) -> None:
         """Run the command."""
+        import torch
+
         from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import save_capture
@@ -61,6 +65,9 @@ class Check(Command):
         if self.json is not None:
             check_writable(self.json.parent)
         device = usable_device(self.device)
+        # Frames are small: threads that share one wait for each other, those with their own do not.
+        threads = min(MOST_THREADS, torch.get_num_threads())
+        torch.set_num_threads(1)
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         found: list[Finding] = []
         capture: Capture | None = None
@@ -76,7 +83,9 @@ class Check(Command):
                 warn(doubt)
             network = load_model("deltas-small", device=device)
             with progress("matching", GROUPS) as report:
-                checked = check_capture(capture, network, known=found, report=report)
+                checked = check_capture(
+                    capture, network, known=found, threads=threads, report=report
+                )
         for line in report_lines(checked, self.capture):
             print(line)
         if self.json is not None:

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
+from room_capture import write_scene
 from run_command import Run, runner
 from small_capture import write_capture
 
@@ -15,7 +14,6 @@ from deltas_geom import PosedViews
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.posed_images import PosedImages
-from deltas_nets.outputs.products import write_depth_png
 from deltas_nets.rooms import render_room
 
 MakeCapture = Callable[..., Path]
@@ -35,19 +33,6 @@ def make_capture(tmp_path: Path) -> MakeCapture:
 def capture(make_capture: MakeCapture) -> Capture:
     """Four frames in a row."""
     return open_capture(make_capture())
-
-
-def write_scene(folder: Path, room: PosedImages) -> None:
-    """A rendered room as ScanNet would have exported it."""
-    for name in ("color", "depth", "pose", "intrinsic"):
-        (folder / name).mkdir(parents=True)
-    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", room.views.K[0].numpy(), fmt="%.6f")
-    world_from_cam = torch.linalg.inv(room.views.cam_from_world.double())
-    for id in range(len(room.images)):
-        pixels = room.images[id].permute(1, 2, 0).numpy()
-        Image.fromarray(pixels).save(folder / "color" / f"{id}.png")
-        write_depth_png(folder / "depth" / f"{id}.png", room.depth[id].numpy())
-        np.savetxt(folder / "pose" / f"{id}.txt", world_from_cam[id].numpy(), fmt="%.9f")
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import write_scene
+from room_capture import write_scene
 from run_command import Run, assert_one_line
 
 from deltas_nets.captures.opening import open_capture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from check_plants import MATCHES, with_depth_of_a_kinect
-from conftest import write_scene
+from room_capture import write_scene
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture

@@ -1,12 +1,12 @@
 """What files and cameras tell of a capture before any image is looked at."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from check_plants import CAMERAS, frames, poses, scaled
-from conftest import MakeCapture
 from PIL import Image, ImageFilter
 
 from deltas_nets.captures.capture import Capture
@@ -17,6 +17,8 @@ from deltas_nets.check.image_sizes import wrong_sizes
 from deltas_nets.check.images import look_at_images
 from deltas_nets.check.quick import quick_findings
 from deltas_nets.check.rewrite import moved_centre
+
+MakeCapture = Callable[..., Path]
 
 
 @pytest.fixture
