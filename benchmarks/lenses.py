@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from deltas_geom import Lens
 
-NUM_PIXELS, REPEATS = 100_000, 7
+NUM_PIXELS, REPEATS = 100_000, 15
 WIDTH, HEIGHT = 1280, 960
 GOAL = "2"
 MODELS: dict[str, list[float]] = {
