@@ -18,7 +18,7 @@ from deltas_geom.cameras.lenses.angles import (
 )
 from deltas_geom.numerics.arithmetic import only, unless_all
 
-_TURN = 5e-5
+_TURN = 2e-4
 """Of the derivative at the axis: where a division has less, pixels are lost to rounding."""
 
 Coefficients = Sequence[Tensor]  # each (*B, 1)

@@ -11,10 +11,8 @@ from torch import Tensor
 
 from deltas_geom.cameras.lenses.angles import root
 from deltas_geom.cameras.lenses.terms import (
-    Jacobian,
     Pair,
     Terms,
-    distort,
     distort_and_derive,
     gain,
     image_radius,
@@ -22,8 +20,6 @@ from deltas_geom.cameras.lenses.terms import (
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 
 _PLAIN, _POLISH, _BRACKETED, _CAREFUL = 4, 3, 60, 20
-_ENOUGH, _REUSED = 1e-3, 3
-"""A step after which so many more, with the same derivative, are enough."""
 _FOLLOWED = 2
 """Steps with gradient, of which each doubles the order to which derivatives are right."""
 
@@ -51,12 +47,11 @@ def undistort(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted
         v: ``(*B, N)``.
         within: ``(*B, 1)`` from :func:`one_to_one_within`.
     """
-    s = torch.addcmul(u * u, v, v)
-    first = _solve(terms, u, v, within, _plain_scale(terms, s))
+    first = _solve(terms, u, v, within, _plain_scale(terms, u, v), _POLISH)
     if surely_all(first.found):
         return first
     # Beyond what the whole disc goes to there is no point to look for.
-    lost = ~first.found & (s <= image_radius(terms, within).square())
+    lost = ~first.found & (torch.addcmul(u * u, v, v) <= image_radius(terms, within).square())
     if not values_at_hand(first.found):
         again = _solve_safely(terms, u, v, within)
         return _either(first, again)
@@ -88,8 +83,9 @@ def _either(first: Undistorted, second: Undistorted) -> Undistorted:
     return Undistorted(x, y, first.found | second.found)
 
 
-def _plain_scale(terms: Terms, s: Tensor) -> Tensor:
-    """q of which q (u, v) is nearly the point, s = u^2 + v^2, by the radial terms alone."""
+def _plain_scale(terms: Terms, u: Tensor, v: Tensor) -> Tensor:
+    """q of which q (u, v) is nearly the point, the radial terms alone being looked at."""
+    s = torch.addcmul(u * u, v, v)
     q = torch.ones_like(s)
     # Where other terms are to come they move the point by more than this.
     enough = 1e-4 if terms.only_radial else 3e-2
@@ -130,7 +126,9 @@ def _bracketed_scale(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Tens
     return q
 
 
-def _solve(terms: Terms, u: Tensor, v: Tensor, within: Tensor, q: Tensor) -> Undistorted:
+def _solve(
+    terms: Terms, u: Tensor, v: Tensor, within: Tensor, q: Tensor, steps: int
+) -> Undistorted:
     """Points near q (u, v), polished on the plane."""
     if terms.only_radial:
         s = torch.addcmul(u * u, v, v)
@@ -140,30 +138,18 @@ def _solve(terms: Terms, u: Tensor, v: Tensor, within: Tensor, q: Tensor) -> Und
         near = step * step * s <= _close(t)
         return Undistorted(q * u, q * v, near & (t < within * within))
     x, y = q * u, q * v
-    for _ in range(_POLISH):
-        place, slope = distort_and_derive(terms, x, y)
-        inverse = _inverse(slope)
-        dx, dy = _step(inverse, place, u, v)
+    dx = dy = x
+    for _ in range(steps):
+        dx, dy = _newton(terms, x, y, u, v)
         x, y = x - dx, y - dy
-        last = torch.addcmul(dx * dx, dy, dy)
-        if surely_all(last < _ENOUGH**2):
-            break
-    # By the derivative of the point before, what is left is as that step times the last.
-    close = (256 * torch.finfo(x.dtype).eps) ** 2
-    for _ in range(_REUSED):
-        dx, dy = _step(inverse, distort(terms, x, y), u, v)
-        x, y = x - dx, y - dy
-        near = torch.addcmul(dx * dx, dy, dy) * last <= close
-        if surely_all(near):
-            break
-    return Undistorted(x, y, near & (torch.addcmul(x * x, y, y) < within * within))
+    return _judged(x, y, dx, dy, within)
 
 
 def _solve_safely(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted:
     """The same from a bracket, by steps that stay in the disc."""
     q = _bracketed_scale(terms, u, v, within)
     if terms.only_radial:
-        return _solve(terms, u, v, within, q)
+        return _solve(terms, u, v, within, q, 1)
     x, y = q * u, q * v
     dx = dy = x
     for _ in range(_CAREFUL):
@@ -175,6 +161,11 @@ def _solve_safely(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undisto
         halfway = (root(t) + within) / 2 * new.rsqrt()
         scale = torch.where(new < within * within, 1.0, halfway)
         x, y = x * scale, y * scale
+    return _judged(x, y, dx, dy, within)
+
+
+def _judged(x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, within: Tensor) -> Undistorted:
+    """Which points solve the equations after a last step, and within the disc."""
     t = torch.addcmul(x * x, y, y)
     near = torch.addcmul(dx * dx, dy, dy) <= _close(t)
     return Undistorted(x, y, near & (t < within * within))
@@ -187,18 +178,9 @@ def _close(t: Tensor) -> Tensor:
 
 def _newton(terms: Terms, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Pair:
     """What a step of Newton's on the plane takes from (x, y)."""
-    place, slope = distort_and_derive(terms, x, y)
-    return _step(_inverse(slope), place, u, v)
-
-
-def _inverse(slope: Jacobian) -> Jacobian:
-    ux, uy, vx, vy = slope
-    of_determinant = torch.addcmul(ux * vy, uy, vx, value=-1).reciprocal()
-    less = -of_determinant
-    return Jacobian(vy * of_determinant, uy * less, vx * less, ux * of_determinant)
-
-
-def _step(inverse: Jacobian, place: Pair, u: Tensor, v: Tensor) -> Pair:
-    ex, ey = place[0] - u, place[1] - v
-    dx = torch.addcmul(inverse.ux * ex, inverse.uy, ey)
-    return dx, torch.addcmul(inverse.vx * ex, inverse.vy, ey)
+    (mx, my), j = distort_and_derive(terms, x, y)
+    ex, ey = mx - u, my - v
+    determinant = torch.addcmul(j.ux * j.vy, j.uy, j.vx, value=-1)
+    dx = torch.addcmul(j.vy * ex, j.uy, ey, value=-1) / determinant
+    dy = torch.addcmul(j.ux * ey, j.vx, ex, value=-1) / determinant
+    return dx, dy
