@@ -53,6 +53,8 @@ class Capture:
     """The format, in a word or two, as "COLMAP text"."""
     metric: bool = True
     """Whether its unit is the metre; structure from motion alone does not know it."""
+    scaled_by: float = 1.0
+    """What its poses and points were multiplied with after they were read."""
     points: SparsePoints | None = None
     """What the program that found the poses triangulated, if it says so."""
     sources: Mapping[str, tuple[str, ...]] | None = None

@@ -26,6 +26,7 @@ def scaled(capture: Capture, factor: float, *, metric: bool = True) -> Capture:
         capture,
         frames=Frames(frames.folder, arrays, memory=frames.memory),
         metric=metric,
+        scaled_by=factor * capture.scaled_by,
         points=None if points is None else points._replace(xyz=points.xyz * factor),
         depth_ranges=None if ranges is None else ranges * factor,
     )

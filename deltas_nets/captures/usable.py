@@ -17,6 +17,8 @@ from deltas_nets.captures.view_sets import (
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
+LEFT_OUT = {False: "a usable pose", True: "an image"}
+"""What frames lack, by whether that is their image."""
 FEW = 5
 """Views of a set where nobody asks for more or less."""
 
@@ -110,5 +112,7 @@ def warn_of(
     scale = doubtful_scale(capture, view_sets, depth_range) if capture.metric else None
     if scale is not None:
         warn(scale)
-    if capture.lost and view_sets_file is None:
-        warn(f"frames without a usable pose are left out: {ids_in_words(capture.lost)}")
+    for reason, words in LEFT_OUT.items() if view_sets_file is None else ():
+        ids = [id for id, lost in capture.lost.items() if (lost.reason == "no image") == reason]
+        if ids:
+            warn(f"frames without {words} are left out: {ids_in_words(ids)}")

@@ -203,6 +203,7 @@ class Depth(Captured, Prediction):
                 "versions": {"deltas-depth": __version__, "torch": torch.__version__},
                 "layout": capture.layout,
                 "unit": options.unit,
+                "scaled_by": capture.scaled_by,
                 "lost_poses": list(map(id_in_json, capture.lost)),
                 "sets_short_of_views": views.short,
             },
@@ -218,8 +219,13 @@ class Depth(Captured, Prediction):
         from deltas_nets.outputs.summary import SUMMARY, read_summary
 
         kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
-        unit = "" if options.unit == "metre" else f", in {options.unit}"
-        print(f"{outcome.written} depth maps in {self.folder}{unit}{kept}")
+        maps = "1 depth map" if outcome.written == 1 else f"{outcome.written} depth maps"
+        print(f"{maps} in {self.folder}{kept}")
+        if options.unit != "metre":
+            steps = (
+                f", {options.depth_scale:g} steps of a PNG in it" if self.format == "png" else ""
+            )
+            print(f"depth is in {options.unit}{steps}; --scale METRES makes it metric")
         if not options.confidence:
             print("no confidence is written: the reference network states none")
         if outcome.blind:

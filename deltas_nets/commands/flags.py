@@ -10,6 +10,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
@@ -87,7 +88,11 @@ class Captured:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         capture = open_capture(path, intrinsics=stated)
-        return capture if self.scale is None else scaled(capture, self.scale)
+        if self.scale is None:
+            return capture
+        if capture.metric and self.scale != 1:
+            warn(f"the capture is in metres already; --scale {self.scale:g} makes it another size")
+        return scaled(capture, self.scale)
 
     def in_metres(
         self, capture: "Capture", predictor: "Predictor", config: "PredictConfig"

@@ -75,8 +75,8 @@ def _no_choice(match: re.Match[str], _: Any) -> str:
 
 
 def _unknown(match: re.Match[str], commands: Mapping[str, type[Command]]) -> str:
-    first = match["options"].split(", ")[0]
-    if "Available subcommands" in match.string:
+    first = re.split(r", | \(applied to", match["options"])[0]
+    if "Available subcommands" in match.string or "(applied to deltas)" in match["options"]:
         near = get_close_matches(first, commands, n=1, cutoff=0.4)
         known = f"did you mean {near[0]}?" if near else f"there are {', '.join(commands)}"
         return f"no command {first}: {known}"
@@ -111,6 +111,6 @@ _SAYINGS: tuple[tuple[str, Callable[[re.Match[str], Any], str]], ...] = (
         r"\((?P<known>.*?)\)",
         _no_choice,
     ),
-    (r"Unrecognized options: (?P<options>[^;]*)", _unknown),
+    (r"Unrecognized (?:or misplaced )?options: (?P<options>[^;]*)", _unknown),
     (r"Missing from (?P<command>[\w ]+): (?P<names>.*)", _missing),
 )

@@ -8,8 +8,8 @@ __all__ = ["Verdict", "verdict"]
 
 USUAL_CONFIDENCE = 0.5
 """The median over a capture of its maps' mean confidence: 0.50 to 0.62 of indoor captures with
-right poses, 0.12 to 0.16 with poses inverted or in OpenGL's axes."""
-LOW_CONFIDENCE = 0.3
+right poses, 0.12 to 0.33 with poses inverted or in OpenGL's axes."""
+LOW_CONFIDENCE = 0.4
 USUAL_SHARE = 0.5  # of keypoints that are triangulated
 
 
@@ -53,5 +53,8 @@ def verdict(records: Sequence[Mapping[str, Any]], *, short: int = 0) -> Verdict:
     if short:
         words.append(f"{short} view sets short of views")
     if low:
-        words.append("the poses or intrinsics are likely wrong: run deltas check")
+        words.append(
+            "which is low: views are too near to each other, surfaces too plain, or poses or "
+            "intrinsics wrong; deltas check tells which"
+        )
     return Verdict(", ".join(words) or "nothing to judge by", low)
