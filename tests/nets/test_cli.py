@@ -104,7 +104,7 @@ def test_a_run_is_continued_and_another_refused(depth: DepthCommand) -> None:
     (depth.out / "depth" / "2.png").unlink()
     kept = (depth.out / "depth" / "1.png").stat().st_mtime_ns
     again = depth("--views", 2)
-    assert "1 depth maps" in again.out and "3 kept" in again.out
+    assert "1 depth map in" in again.out and "3 kept" in again.out
     assert (depth.out / "depth" / "2.png").exists()
     assert (depth.out / "depth" / "1.png").stat().st_mtime_ns == kept
     assert all("seconds" in frame for frame in depth.summary()["frames"].values())
