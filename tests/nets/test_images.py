@@ -11,7 +11,6 @@ from PIL import Image, ImageFile
 from run_command import Run
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.images import ImageMemory, header_of_whole_file
 from deltas_nets.errors import UserError
 

@@ -72,7 +72,7 @@ def test_a_finished_run_is_kept_and_other_weights_are_other_settings(
     assert run(*command, "--weights", checkpoint).code == 0
     (tmp_path / "out" / "depth" / "1.png").unlink()
     again = run(*command, "--weights", checkpoint)
-    assert "1 depth maps" in again.out
+    assert "1 depth map in" in again.out
     assert "1 kept" in again.out
     other = tmp_path / "other.pth"
     changed = tables["state_dict_depth"] | {"conv_final.bias": torch.tensor([2.0])}
