@@ -35,9 +35,6 @@ __all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
 class Reader(Protocol):
     """What a file in readers/ defines."""
 
-    LAYOUT: str
-    """What a capture of this format is, in a few words after "a capture is"."""
-
     def recognises(self, path: Path) -> bool:
         """Whether a folder or file looks like this format; it may be broken, as `read` explains."""
 

@@ -58,7 +58,7 @@ class Depth(Captured, Prediction):
     was stopped."""
     depth_range: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
     """Nearest and farthest depth searched, in the capture's unit. If not given it follows from the
-    capture for each frame: sparse points, sensor depth, or a first look; 0.5 10 in rooms."""
+    capture for each frame: its ranges, its sparse points, or a first look; 0.5 10 in rooms."""
     view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen by angle and overlap if not given."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
@@ -87,22 +87,20 @@ class Depth(Captured, Prediction):
         from deltas_nets.captures.usable import check_all, usable_view_sets, warn_of
         from deltas_nets.captures.working_depth import knows_its_scale
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
-        from deltas_nets.outputs.products import check_depth_fits
         from deltas_nets.predict.capture import predict_capture
-        from deltas_nets.predict.first_look import depth_seen
+        from deltas_nets.predict.first_look import ANCHORS, ROUNDS, depth_seen
         from deltas_nets.predict.search import Asked, Followed
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
         options = self._options()
-        if self.depth_range is not None:
-            check_depth_fits(self.depth_range, options)
         capture = self.opened(self.capture).remembering()
         predictor = self.predictor()
         capture = self.in_metres(capture, predictor, config)
-        guesses = not knows_its_scale(capture)
-        # Where nothing tells how far surfaces are a few maps do, before views are chosen.
-        depth = depth_seen(predictor, capture, config) if guesses else None
+        depth = None
+        if not knows_its_scale(capture):  # then a few maps tell, before views are chosen
+            with progress("first look", ROUNDS * ANCHORS) as report:
+                depth = depth_seen(predictor, capture, config, report=report)
         found = usable_view_sets(
             capture,
             self.view_sets,
@@ -151,14 +149,13 @@ class Depth(Captured, Prediction):
         from deltas_nets.captures.working_depth import working_depths
         from deltas_nets.outputs.products import OWN_UNIT, check_depth_fits, steps_to
 
-        far = farthest_depth(capture)
+        far = self.depth_range[1] if self.depth_range else farthest_depth(capture)
         if not capture.metric:
             options = replace(options, unit=OWN_UNIT)
             usual = float(working_depths(capture).max()) if depth is None else depth
             if self.depth_scale is None:
                 return replace(options, depth_scale=steps_to(max(far, 4 * usual)))
-        if self.depth_range is None and far > 0:
-            check_depth_fits((0.0, far), options)
+        check_depth_fits((0.0, far), options)
         return options
 
     def _folder(

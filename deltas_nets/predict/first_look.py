@@ -1,6 +1,7 @@
 """What a few maps tell of a whole capture: how far its surfaces are, how long its unit is."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +31,20 @@ ENOUGH = 50
 """Pixels where map and sensor are compared."""
 
 
-def depth_seen(predictor: Predictor, capture: Capture, config: PredictConfig) -> float:
+def depth_seen(
+    predictor: Predictor,
+    capture: Capture,
+    config: PredictConfig,
+    *,
+    report: Callable[[str], None] = lambda _: None,
+) -> float:
     """How far typical surfaces are, in the capture's unit: as it knows, or as a first look finds.
+
+    Args:
+        predictor: of a trained network.
+        capture: the frames.
+        config: all but the range.
+        report: called with the id of every frame that was looked at, ``ANCHORS`` at a time.
 
     Raises:
         UserError: an image cannot be read, or there are fewer than two frames.
@@ -40,11 +53,11 @@ def depth_seen(predictor: Predictor, capture: Capture, config: PredictConfig) ->
         return float(np.median(working_depths(capture)))
     search, depth = Followed(capture), guessed_depth(capture)
     for _ in range(ROUNDS):
-        found = [
-            found_depths(search(predictor, views, config).map)
-            for views in _some(capture, working_depth=depth)
-        ]
-        medians = [float(np.median(depths)) for depths in found if len(depths)]
+        medians = []
+        for views in _some(capture, working_depth=depth):
+            depths = found_depths(search(predictor, views, config).map)
+            medians += [float(np.median(depths))] if len(depths) else []
+            report(views.anchor)
         if not medians:
             break
         before, depth = depth, float(np.median(medians))
@@ -104,12 +117,17 @@ def scale_by_measurements(
         if id not in maps:
             (views,) = _some(capture, anchors=[capture.frame(id).id])
             maps[id] = search(predictor, views, config).map.depth
-        row, column = round(y), round(x)
-        inside = 0 <= row < maps[id].shape[0] and 0 <= column < maps[id].shape[1]
-        if not (inside and metres > 0):
-            what = f"line {number}: no pixel ({x:g}, {y:g}) of frame {id} is {metres:g} m away"
-            raise UserError(what, file, form)
-        ratios.append(metres / float(maps[id][row, column]))
+        if not 0 < metres < math.inf:
+            raise UserError(f"line {number}: {metres:g} m is no depth", file, form)
+        height, width = maps[id].shape
+        if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
+            what = f"line {number}: pixel ({x:g}, {y:g}) is outside of frame {id}, {width}x{height}"
+            raise UserError(what, file, "give pixels of the photo: x to the right, y down")
+        found = float(maps[id][round(y), round(x)])
+        if found == 0:
+            what = f"line {number}: no depth was found at pixel ({x:g}, {y:g}) of frame {id}"
+            raise UserError(what, file, "measure nearer to the middle of the photo")
+        ratios.append(metres / found)
     if not ratios:
         raise UserError("the file of measured depths is empty", file, form)
     return float(np.median(ratios))

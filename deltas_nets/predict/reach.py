@@ -22,8 +22,8 @@ BEYOND = 1.25
 WIDER = 10.0
 PILED = (0.05, 0.15)
 """Shares of points at the near and the far end of a search that tell that it was too short. Of good
-searches less than 0.001 and 0.02 are there; of rooms that are a fifth as large, searched as rooms,
-two thirds at the near end."""
+searches hardly any are there; of rooms that are a fifth as large, searched as rooms, most are at
+the near end."""
 
 
 class Reach(NamedTuple):

@@ -63,8 +63,6 @@ def test_ids_survive_json(id: str) -> None:
 class Lists:
     """A reader: a folder with a file frames.txt, an id on each line, "!" before one that is bad."""
 
-    LAYOUT = "a file frames.txt"
-
     def recognises(self, path: Path) -> bool:
         return (path / "frames.txt").exists()
 

@@ -49,6 +49,14 @@ class Oracle:
         return DepthMap(map, np.ones_like(map), points, np.zeros((1, 3), np.uint8), keypoints)
 
 
+class Blind(Oracle):
+    """Finds points and writes no map."""
+
+    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+        found = super().depth_map(frames, config)
+        return found._replace(depth=np.zeros_like(found.depth))
+
+
 def with_points(capture: Capture, wall: float, *, seen: bool = True) -> Capture:
     """With a grid of sparse points on a wall at a depth."""
     xyz = np.stack(np.broadcast_arrays(*np.mgrid[-1:1:8j, -1:1:8j], 0.0), axis=-1).reshape(-1, 3)
@@ -172,10 +180,14 @@ def test_the_scale_is_found_by_sensor_and_by_hand(capture: Capture, tmp_path: Pa
     file = tmp_path / "measured.txt"
     file.write_text("# tape\n1 10 20 2.5\n2 3.2 4 2.4\n0 5 5 2.6\n")
     assert scale_by_measurements(oracle, small, config, file) == pytest.approx(10)  # type: ignore[arg-type]
-    for text in ("1 10 20", "1 10 20 -3", "1 999 20 2", "1 x 20 2", "", "nobody 1 1 1"):
+    wrong = ("1 10 20", "1 10 20 -3", "1 10 20 inf", "1 999 20 2", "1 nan 2 2", "1 x 20 2", "")
+    for text in (*wrong, "nobody 1 1 1"):
         file.write_text(text)
         with pytest.raises(UserError):
             scale_by_measurements(oracle, small, config, file)  # type: ignore[arg-type]
+    file.write_text("1 10 20 2.5")
+    with pytest.raises(UserError, match="no depth was found"):
+        scale_by_measurements(Blind(2.5), small, config, file)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="no sensor depth"):
         scale_by_sensor(oracle, no_sensor(small), config)  # type: ignore[arg-type]
 

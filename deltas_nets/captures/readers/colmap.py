@@ -30,9 +30,8 @@ from deltas_nets.captures.readers.names import frame_ids, without_common_folder
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "capture_of_model", "read", "recognises"]
+__all__ = ["capture_of_model", "read", "recognises"]
 
-LAYOUT = "a folder with a COLMAP model (cameras, images, points3D as .bin or .txt) and its images"
 IMAGE_FOLDERS = ("images", "input")
 """Where programs that use COLMAP look for images: beside the model, or a folder or two above."""
 LARGEST_SIZE = 2**20

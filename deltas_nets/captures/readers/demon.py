@@ -15,9 +15,8 @@ from deltas_nets.captures.readers.poses import cam_from_world, missing_images
 from deltas_nets.captures.text_lines import read_lines
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "cam.txt, poses.txt and 0000.jpg (DeMoN as DPSNet prepared it)"
 _REMEDY = "write a line of 12 numbers for each image, world-to-camera"
 
 

@@ -21,9 +21,8 @@ from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "sensors/sensors.txt, records_camera.txt and trajectories.txt (kapture)"
 _REMEDY = "write it as kapture 1.1 does: values between commas"
 _STRAIGHT = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
 """Models that bend nothing where their coefficients are 0."""

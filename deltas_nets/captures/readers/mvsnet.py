@@ -16,9 +16,8 @@ from deltas_nets.captures.readers.poses import cam_from_world, missing_images
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "cams/00000000_cam.txt and images (MVSNet)"
 PLANES = 192
 """Depths that MVSNet tries where a file states the first and their distance only."""
 _CAMERAS = ("cams", "cams_1")

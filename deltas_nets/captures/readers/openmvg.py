@@ -20,9 +20,8 @@ from deltas_nets.captures.readers.poses import cam_from_world, missing_images, r
 from deltas_nets.captures.readers.sparse import observed
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "sfm_data.json and images (OpenMVG)"
 _REMEDY = "export it again: openMVG_main_ConvertSfM_DataFormat -i sfm_data.bin -o sfm_data.json"
 _LENSES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {
     "pinhole": ("", "", ()),

@@ -25,9 +25,8 @@ from deltas_nets.captures.readers.sparse import observed
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "reconstruction.json and images (OpenSfM)"
 _REMEDY = "run opensfm reconstruct again"
 _LENSES = {
     "perspective": ("RADIAL", ("k1", "k2")),

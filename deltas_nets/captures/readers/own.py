@@ -34,9 +34,8 @@ from deltas_nets.captures.readers.own_table import (
 )
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "NAMES", "read", "recognises"]
+__all__ = ["NAMES", "read", "recognises"]
 
-LAYOUT = "frames.json or frames.csv (ours: docs/captures.md) and its images"
 NAMES = ("frames.json", "frames.csv")
 METRES = ("metres", "meters", "m")
 

@@ -14,9 +14,8 @@ from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, missing_images
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "keyframes/corrected_cameras (Polycam's raw data)"
 _REMEDY = "export raw data from Polycam again"
 _JSON_LIMIT = 2**20
 _KINDS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))

@@ -16,9 +16,8 @@ from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, missin
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "metadata.json, rgb and depth (Record3D's EXR export)"
 _REMEDY = "export the recording from Record3D again, as EXR and JPEG sequence"
 
 

@@ -14,9 +14,8 @@ from deltas_nets.captures.readers.cameras import camera_matrix
 from deltas_nets.captures.readers.poses import cam_from_world, missing_images
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "key and source with image.png, K.npy, to_ref_transform.npy (Robust MVD)"
 _REMEDY = "write image.png, K.npy (3x3) and to_ref_transform.npy (4x4) into each folder"
 _LIMIT = 2**16
 

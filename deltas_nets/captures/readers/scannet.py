@@ -13,9 +13,8 @@ from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrin
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "NESTING", "is_scene", "read", "recognises", "world_from_cam_inverse"]
+__all__ = ["NESTING", "is_scene", "read", "recognises", "world_from_cam_inverse"]
 
-LAYOUT = "folders color, pose and intrinsic (ScanNet's export layout)"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
 """Folders that scenes may lie in, inside of the one that is named."""

@@ -17,9 +17,8 @@ from deltas_nets.captures.readers.cameras import camera_matrix
 from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "a file SCENE.sens (ScanNet)"
 VERSION = 4
 MOST_FRAMES = 200_000
 """Two hours at 30 Hz."""

@@ -22,9 +22,8 @@ from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "frame-000000.color.png and .pose.txt (7-Scenes)"
 COLOUR_FOCAL, DEPTH_FOCAL = 525.0, 585.0
 """Of the sensor's two cameras at 640x480, principal point (320, 240); the data set states the
 second and no calibration of the first, for which 525 is what the maker says."""

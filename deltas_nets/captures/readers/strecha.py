@@ -17,9 +17,8 @@ from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "0000.jpg and 0000.jpg.camera (Strecha)"
 _REMEDY = "write K (3x3), three zeros, R (3x3, camera-to-world), the centre, width and height"
 
 

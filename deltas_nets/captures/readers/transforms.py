@@ -35,9 +35,8 @@ from deltas_nets.captures.readers.scannet import world_from_cam_inverse
 from deltas_nets.captures.readers.transforms_cameras import StatedCamera, stated_camera
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognises"]
+__all__ = ["read", "recognises"]
 
-LAYOUT = "transforms.json (nerfstudio, instant-ngp) and its images"
 NAME = "transforms.json"
 PARTS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 REMEDY = "export it again, or mend it by hand"

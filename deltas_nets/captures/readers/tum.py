@@ -22,9 +22,8 @@ from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
-__all__ = ["LAYOUT", "read", "read_with", "recognises"]
+__all__ = ["read", "read_with", "recognises"]
 
-LAYOUT = "rgb.txt and groundtruth.txt (TUM RGB-D)"
 STEPS = 5000.0
 """Steps of depth in a metre."""
 APART = 0.02
