@@ -13,14 +13,21 @@ from hypothesis import strategies as st
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.keyframes import keyframes
 from deltas_nets.captures.known_depths import farthest_depth, points_in_view
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
-from deltas_nets.captures.working_depth import guessed_depth, knows_its_scale, working_depths
+from deltas_nets.captures.working_depth import (
+    SPACINGS,
+    guessed_depth,
+    knows_its_scale,
+    working_depths,
+)
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.verdict import verdict
+from deltas_nets.predict import search
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig
 from deltas_nets.predict.first_look import depth_seen, scale_by_measurements, scale_by_sensor
 from deltas_nets.predict.look import look
@@ -133,11 +140,16 @@ def test_a_range_that_the_capture_states_is_searched(capture: Capture) -> None:
     assert np.allclose(found.map.depth, 0.3)
 
 
-def test_a_sensor_is_asked_where_points_pile_up(capture: Capture) -> None:
-    near = scaled(capture, 1.0)  # whose sensor says 2.5 m, and the network 0.3 in vain
+def test_a_sensor_is_asked_where_points_pile_up(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = np.full(100, 0.3)
+    monkeypatch.setattr(search, "depths_of_sensor", lambda *_: measured)
     oracle = Oracle(0.3)
-    found = Followed(near)(oracle, VIEWS, PredictConfig())
-    assert oracle.asked[0] == ROOM and len(oracle.asked) > 1 and found.piled is None
+    found = Followed(capture)(oracle, VIEWS, PredictConfig())
+    assert len(oracle.asked) == 2 and found.piled is None
+    assert found.reach == reach_of(measured, metric=True)
+    assert Followed(capture)(Oracle(2.5), VIEWS, PredictConfig()).reach == Reach(*ROOM)
 
 
 def test_a_range_that_is_asked_for_is_what_is_searched(capture: Capture) -> None:
@@ -160,6 +172,24 @@ def test_maps_and_views_do_not_depend_on_the_unit(unit: float) -> None:
 
 def test_cameras_that_look_at_one_thing_tell_how_far_it_is() -> None:
     assert guessed_depth(orbit(radius=3.0)) == pytest.approx(3.0, rel=1e-6)
+    # Back to back, axes meet behind the cameras: then their spacing is all there is.
+    spacing = 2 * 3.0 * np.sin(1 / 12)
+    assert guessed_depth(orbit(radius=-3.0)) == pytest.approx(SPACINGS * spacing, rel=1e-6)
+    # As little does an axis that was met before the other camera stood there.
+    first, second = orbit(count=2, step=0.3).frames.values()
+    aside = second.cam_from_world.copy()
+    aside[:3, 3] = -aside[:3, :3] @ [1.0, 0, 5.0 + first.cam_from_world[2, 3]]
+    pair = Frames.of([first, replace(second, cam_from_world=aside)])
+    apart = np.linalg.norm(np.subtract(*_centres(pair)))
+    assert guessed_depth(Capture(Path(), pair, {})) == pytest.approx(SPACINGS * apart)
+
+
+def test_keyframes_are_those_that_see_something_new() -> None:
+    around = orbit(radius=2.0, count=60, step=0.02)  # 4 cm and 1.1 degrees a frame
+    assert keyframes(around) == [str(id) for id in range(0, 60, 4)]  # 5 % of 2.5 m, as in rooms
+    assert keyframes(around, working_depth=100.0) == [str(id) for id in range(0, 60, 7)]  # 8 deg
+    again = scaled(around, 50.0, metric=False)  # which is looked at from twice 50 of its units
+    assert keyframes(again) == [str(id) for id in range(0, 60, 3)]
 
 
 def test_a_look_in_another_unit_comes_back_in_the_captures(capture: Capture) -> None:
@@ -206,12 +236,16 @@ def no_sensor(capture: Capture) -> Capture:
     return replace(capture, frames=Frames.of(frames, capture.frames.folder))
 
 
-def orbit(radius: float = 2.0, count: int = 12) -> Capture:
+def _centres(frames: Frames) -> np.ndarray:
+    return np.array([-p[:3, :3].T @ p[:3, 3] for p in frames.cam_from_world])
+
+
+def orbit(radius: float = 2.0, count: int = 12, step: float = 1 / 6) -> Capture:
     """Cameras on a circle that look at its centre."""
     K = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
     frames = []
     for number in range(count):
-        cos, sin = np.cos(number / 6), np.sin(number / 6)
+        cos, sin = np.cos(number * step), np.sin(number * step)
         pose = np.eye(4)
         pose[:3, :3] = [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]
         pose[2, 3] = radius

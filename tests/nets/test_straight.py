@@ -100,8 +100,8 @@ class Sees:
         frame = frames[0]
         assert frame.lens is None and config.size is None
         grid = pixel_grid(frame.image_size, dtype=torch.float64)
-        slope = (grid[:, 0].numpy() - frame.K[0, 2]) / frame.K[0, 0]
-        depth = (2 / (1 + 0.3 * slope)).reshape(frame.image_size).astype(np.float32)
+        x, y = ((grid.numpy() - frame.K[:2, 2]) / np.diag(frame.K)[:2]).T
+        depth = (2 / (1 + 0.15 * x + 0.1 * y)).reshape(frame.image_size).astype(np.float32)
         keypoints = KeypointDepths(grid[:5].float(), torch.ones(5), frame.image_size)
         log_std = torch.zeros(1, *frame.image_size)
         empty = np.zeros((0, 3))
@@ -113,7 +113,8 @@ def test_depth_is_of_the_photos_pixels(name: str, tmp_path: Path) -> None:
     photo = photo_of(name, tmp_path)
     found = look(Sees(), [photo], PredictConfig(size=SIZE), Reach(0.5, 10.0))  # type: ignore[arg-type]
     rays = rays_of(photo.lens, K, SIZE)
-    true = 2 / (1 + 0.3 * rays[..., 0] / rays[..., 2])
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    true = 2 / (1 + 0.15 * x + 0.1 * y)
     known = found.depth > 0
     assert known.mean() > 0.97
     assert np.abs(found.depth - true)[known].max() < 0.02
@@ -132,7 +133,9 @@ def test_wide_fisheyes_are_cut_and_say_where(tmp_path: Path) -> None:
     wide = Frame("w", tmp_path / "w.png", SIZE, K, np.eye(4), lens=lens)
     frame = straight(wide)
     assert isinstance(frame, StraightFrame)
-    slopes = (np.array(frame.image_size[::-1]) / 2) / np.diag(frame.K)[:2]
+    sides = np.array(frame.image_size[::-1])
+    assert np.allclose(frame.K[:2, 2], (sides - 1) / 2)  # as the lens is in the middle, too
+    slopes = (sides / 2) / np.diag(frame.K)[:2]
     assert (slopes < np.tan(np.radians(61))).all()
     place = pixels_of_photo(frame, SIZE)
     assert place[48, 63] >= 0 and place[0, 0] == place[95, 127] == -1
