@@ -12,7 +12,7 @@ from deltas_nets.captures.writers import colmap, own, scannet, transforms
 from deltas_nets.captures.writers.files import Placing
 from deltas_nets.errors import UserError
 
-__all__ = ["WRITERS", "Writer", "save_capture"]
+__all__ = ["WRITERS", "Writer", "check_new", "save_capture"]
 
 Writer = Callable[[Capture, Path, Placing], list[str]]
 
@@ -24,6 +24,17 @@ WRITERS: Mapping[str, Writer] = {
     "transforms": transforms.write,
 }
 """By the name of the format; see `deltas_nets.captures.writers` for what they do."""
+
+
+def check_new(out: Path) -> None:
+    """Whether a folder is there for a capture to be written to.
+
+    Raises:
+        UserError: it holds something, or is a file.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        what = "the folder is not empty" if out.is_dir() else "this is a file, not a folder"
+        raise UserError(what, out, "name a new folder")
 
 
 def save_capture(
@@ -49,9 +60,7 @@ def save_capture(
     out = Path(out)
     if to not in WRITERS:
         raise UserError(f"there is no format {to!r}", "--to", f"use {', '.join(WRITERS)}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        what = "the folder is not empty" if out.is_dir() else "this is a file, not a folder"
-        raise UserError(what, out, "name a new folder")
+    check_new(out)
     if not capture.frames:
         raise UserError("no frame can be used", capture.path, "see why with deltas depth")
     beside = Path(os.path.abspath(out))

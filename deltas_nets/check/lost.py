@@ -21,8 +21,8 @@ def lost_frames(capture: Capture) -> list[Finding]:
         if ids:
             what = capture.lost[ids[0]].error
             evidence = f"{len(ids)} of {total} frames ({ids_in_words(ids)}): {what.what}"
-            left = "they are left out; to be rid of them"
-            found.append(Finding(cause, evidence, ids, f"{cure}: {left}", "warning", _without_lost))
+            cure = f"{cure}; depth is made of the others"
+            found.append(Finding(cause, evidence, ids, cure, "warning", _without_lost))
     return found
 
 

@@ -24,7 +24,8 @@ class Check(Command):
     Looks at files, cameras, images and sensor depth, and matches frames spread over the capture:
     poses that are inverted, have other axes or belong to other frames, intrinsics of other images,
     frames that disagree with all others, and more. Nothing is written unless asked for. The exit
-    status is 0 where nothing is found, 1 where something is, and 2 where nothing could be checked.
+    status is 0 where nothing is found, 1 where something is, which may be that a capture cannot be
+    read, and 2 where there is none.
 
     Example: deltas check my_capture --mend mended_capture
     """
@@ -51,7 +52,7 @@ class Check(Command):
 
         from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.saving import save_capture
+        from deltas_nets.captures.saving import check_new, save_capture
         from deltas_nets.check.matched import GROUPS
         from deltas_nets.check.refused import refused
         from deltas_nets.check.verdict import Checked, check_capture
@@ -64,6 +65,8 @@ class Check(Command):
 
         if self.json is not None:
             check_writable(self.json.parent)
+        if self.mend is not None:
+            check_new(self.mend)
         device = usable_device(self.device)
         # Frames are small: threads that share one wait for each other, those with their own do not.
         threads = min(MOST_THREADS, torch.get_num_threads())

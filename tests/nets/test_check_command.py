@@ -92,6 +92,15 @@ def test_a_fault_is_named_and_mended_by_the_command_that_is_told(
     assert open_capture(out).layout != "" and run("check", out).code == 0
 
 
+def test_a_place_that_is_taken_is_told_before_anything_is_matched(
+    run: Run, copy: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    told = run("check", copy, "--mend", tmp_path / "mine")
+    assert told.code == 2 and "not empty" in told.err and "matching" not in told.out
+
+
 def test_a_capture_that_nothing_mends_is_one_finding(run: Run, copy: Path, tmp_path: Path) -> None:
     (copy / K_FILE).write_text("no matrix")
     result = run("check", copy, "--json", tmp_path / "told.json", "--mend", tmp_path / "mended")
