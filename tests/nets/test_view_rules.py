@@ -1,6 +1,9 @@
 """Which frames of a scene are looked at together, by gap or by baseline."""
 
+import errno
 import itertools
+import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,12 +140,28 @@ def test_scenes_that_are_not_there_are_counted(scannet_root: Path, tmp_path: Pat
     assert said[1] == "2 of its 3 scenes are not there: scene0300_00, scene0301_00"
 
 
-def test_what_the_system_does_not_read_is_named(scannet_copy: Path) -> None:
+def test_a_pose_that_is_no_file_costs_its_frame(scannet_copy: Path) -> None:
     file = scannet_copy / "scans" / "scene0706_01" / "pose" / "3.txt"
     file.unlink()
     file.mkdir()
-    with pytest.raises(UserError, match=r"scenes cannot be read .*directory.*pose/3.txt: check"):
-        opened(replace(SCANNET, root=str(scannet_copy)))
+    said: list[str] = []
+    opened(replace(SCANNET, root=str(scannet_copy)), report=said.append)
+    assert "1 without a finite pose" in said[0]
+
+
+def test_what_the_system_does_not_read_is_named(
+    scannet_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = Path.iterdir
+
+    def forbidden(folder: Path) -> Iterator[Path]:
+        if folder.name == "pose":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", forbidden)
+    with pytest.raises(UserError, match=r"scenes cannot be read .*denied.*/pose: check"):
+        opened(replace(SCANNET, root=str(scannet_root)))
 
 
 def test_view_sets_by_baseline_come_from_the_config(scannet_root: Path) -> None:
