@@ -115,12 +115,12 @@ def distorted(case: Case) -> Callable[[Array, Array], tuple[Array, Array]]:
 def seen_from_the_axis(case: Case, pixels: Tensor) -> Array:
     """Which pixels lie within the image of the curve at which the derivative first vanishes.
 
-    The derivative is that of complex numbers, along 1440 directions from the axis: independent of
+    The derivative is that of complex numbers, along 360 directions from the axis: independent of
     how the library finds points, and of how it bounds them.
     """
     place, goal = distorted(case), on_plane(case.lens(), pixels)
-    turn = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
-    r = np.linspace(0, np.pi if "FISHEYE" in case.model else 6, 4000)[1:, None]
+    turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    r = np.linspace(0, np.pi if "FISHEYE" in case.model else 6, 1000)[1:, None]
     x, y = r * np.cos(turn), r * np.sin(turn)
     with np.errstate(all="ignore"):
         ax, ay = (part.imag / 1e-30 for part in place(x + 1e-30j, y))

@@ -9,10 +9,18 @@ import torch
 from operations import METHODS, OPERATIONS, Inputs, chosen, followed, inputs_in, tensors_of
 from stand_in_device import DEVICE, MixedDevices, on_device, one_device, to_device
 
+from deltas_geom.cameras.lenses import inverse, undistort
 from deltas_geom.testing.fixed_scenes import seeded_scene
 
 # How long tracks are decides what is computed at a time: these read indices, and say so.
 GROUP = {"refine_tracks", "track_covariance", "triangulate_robust_tracks"}
+
+
+@pytest.fixture(autouse=True)
+def few_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turns of a loop have the same operations: three tell what sixty do."""
+    for module, name in ((inverse, "_BRACKETED"), (inverse, "_CAREFUL"), (undistort, "_HALVINGS")):
+        monkeypatch.setattr(module, name, 3)
 
 
 def there_and_back(name: str, dtype: torch.dtype) -> list[str]:

@@ -62,12 +62,15 @@ def test_without_noise_the_true_point_is_found(scene: PosedScene, offset: Tensor
     assert_close(refined.points, scene.points, rtol=0, atol=1e-9)  # m
 
 
-def test_a_compiled_step_is_the_same() -> None:
+# What torch.compile does before a compiler sees the graph is what may break.
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_a_compiled_step_is_the_same(backend: str) -> None:
     scene = scene_at(30, num_views=3, count=40)
     proj, pixels = scene.views.proj, scene.pixels.clone()
     pixels[1, 3] = torch.nan
     torch.compiler.reset()
-    compiled = torch.compile(refine_points, fullgraph=True)(proj, pixels, scene.points)
+    traced = torch.compile(refine_points, fullgraph=True, backend=backend)
+    compiled = traced(proj, pixels, scene.points)
     eager = refine_points(proj, pixels, scene.points)
     assert_close(compiled.points, eager.points, rtol=0, atol=1e-9)  # m
     assert_close(compiled.residual, eager.residual, rtol=0, atol=1e-9)  # px
