@@ -15,10 +15,11 @@ from deltas_nets.commands.depth import Depth
 from deltas_nets.commands.distill import Distill
 from deltas_nets.commands.evaluate import Evaluate
 from deltas_nets.commands.export import Export
+from deltas_nets.commands.page import Page
 from deltas_nets.commands.recipe import Recipe
 from deltas_nets.commands.train import Train
 
-COMMANDS = (Demo, Depth, Check, Convert, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
+COMMANDS = (Demo, Depth, Page, Check, Convert, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
 
 
 def main() -> None:

@@ -41,10 +41,10 @@ class Depth(Captured, Prediction):
 
     The capture is a COLMAP model with its photos, a transforms.json, a phone's or a tracker's
     export, or frames.json of your own: docs/captures.md lists them all. Writes DIR/depth/ID.png
-    (16-bit millimetres), DIR/confidence/ID.png, DIR/points/ID.ply and DIR/summary.json. Where the
-    capture has no metres, neither have these: they are in its own unit, as the summary says. The
-    network that the authors of the paper published states no confidence, so with its checkpoint
-    none is written.
+    (16-bit millimetres), DIR/confidence/ID.png, DIR/points/ID.ply, DIR/summary.json, and
+    DIR/index.html to look at. Where the capture has no metres, neither have these: they are in its
+    own unit, as the summary says. The network that the authors of the paper published states no
+    confidence, so with its checkpoint none is written.
 
     Example: deltas depth my_capture --views 5
     """
@@ -74,6 +74,8 @@ class Depth(Captured, Prediction):
     """Size of the maps; the colour image's if not given."""
     min_confidence: float = 0.0
     """Leave out pixels of less confidence, 0 to 1."""
+    page: bool = True
+    """Also write index.html to look at, contact_sheet.jpg and preview/ID.jpg."""
     shard: str = "1/1"
     """I/N: this run does every N-th frame from the I-th, for N runs at once."""
     overwrite: Flag = False
@@ -131,6 +133,8 @@ class Depth(Captured, Prediction):
                 report=report,
             )
         self._tell(outcome, folder, options)
+        if self.page:
+            self._show(capture)
 
     def _options(self) -> "OutputOptions":
         from deltas_nets.outputs.products import OutputOptions
@@ -210,6 +214,22 @@ class Depth(Captured, Prediction):
     def folder(self) -> Path:
         """Where outputs go."""
         return self.out or Path(f"{self.capture.resolve().stem}-depth")
+
+    def _show(self, capture: "Capture") -> None:
+        """Write the page; maps are worth more, so what hinders it is only a warning."""
+        from deltas_nets.outputs.summary import SUMMARY, read_summary
+        from deltas_nets.page.maps import open_maps
+        from deltas_nets.page.write import write_page
+
+        if (read_summary(self.folder / SUMMARY) or {}).get("status") != "complete":
+            return  # another shard does it
+        try:
+            maps = open_maps(capture, self.folder)
+            with progress("page", len(maps.ids)) as report:
+                page = write_page(maps, depth_range=self.range, report=report)
+            print(page.line)
+        except UserError as error:
+            warn(f"no page to look at is written: {error}; deltas page goes on from there")
 
     def _tell(self, outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions") -> None:
         """What became of it all, in a few lines."""

@@ -1,0 +1,51 @@
+"""The command `deltas page`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deltas_nets.commands.command import Command
+from deltas_nets.commands.flags import Flag
+from deltas_nets.terminal import progress
+
+
+@dataclass(frozen=True)
+class Page(Command):
+    """Write a page that shows the depth maps of a capture: index.html beside them.
+
+    `deltas depth` does it at its end; this does it for an existing folder, or again once `deltas
+    fuse` has put mesh.ply or cloud.ply there. The page needs no network and no other file. Beside
+    it: contact_sheet.jpg, and preview/ID.jpg, each map in colours above a scale.
+
+    Example: deltas page my_capture my_capture-depth
+    """
+
+    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
+        kw_only=True
+    )
+    """Folder or file of the capture that the maps are of."""
+    depths: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEPTHS")] = field(
+        kw_only=True
+    )
+    """Folder that deltas depth filled."""
+    depth_range: Annotated[tuple[float, float], tyro.conf.arg(metavar="NEAR FAR")] = (0.5, 10.0)
+    """Of sensor depth that counts for errors, metres."""
+    intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
+    """As they were given to deltas depth, if they were."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from deltas_nets.captures.camera_words import Intrinsics
+        from deltas_nets.captures.opening import open_capture
+        from deltas_nets.page.maps import open_maps
+        from deltas_nets.page.write import write_page
+
+        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
+        maps = open_maps(open_capture(self.capture, intrinsics=stated), self.depths)
+        with progress("page", len(maps.ids)) as report:
+            page = write_page(maps, depth_range=self.depth_range, report=report)
+        print(page.line)

@@ -1,0 +1,1 @@
+"""What `deltas depth` found, to look at: coloured maps, a contact sheet, a page of its own."""

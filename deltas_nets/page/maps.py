@@ -1,0 +1,149 @@
+"""A folder of depth maps together with the capture that they are of."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.scaled import scaled
+from deltas_nets.errors import UserError
+from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map
+from deltas_nets.outputs.products import read_points_ply
+from deltas_nets.outputs.summary import (
+    SUMMARY,
+    read_summary,
+    recorded_depth_scale,
+    recorded_view_sets,
+)
+from deltas_nets.terminal import warn
+
+__all__ = ["Maps", "open_maps"]
+
+METRE = "metre"
+
+
+class Maps(NamedTuple):
+    """Depth maps that `deltas depth` wrote, and where they are seen from.
+
+    Attributes:
+        folder: that holds them.
+        capture: in the unit of the maps.
+        ids: of the frames that have a map, in the order of the capture.
+        missing: frames that were to have one.
+        summary: what the run recorded.
+        steps: of a depth PNG in the unit.
+    """
+
+    folder: Path
+    capture: Capture
+    ids: tuple[str, ...]
+    missing: tuple[str, ...]
+    summary: Mapping[str, Any]
+    steps: float
+
+    @property
+    def unit(self) -> str:
+        """The maps' unit in a word: m, or units where the capture has no metres."""
+        return "m" if self.summary.get("unit", METRE) == METRE else "units"
+
+    def record(self, id: str) -> Mapping[str, Any]:
+        """What the summary says of a frame; empty where it says nothing."""
+        record = self.summary["frames"].get(id)
+        return record if isinstance(record, dict) else {}
+
+    def depth(self, id: str) -> NDArray[np.float32]:
+        """``(H, W)`` in the capture's unit, 0 where there is none.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        depth = read_depth_map(self.folder, id, self.steps)
+        if depth.ndim != 2 or depth.size == 0:
+            file = self.folder / "depth" / id
+            raise UserError("this is no depth map", file, "run deltas depth again")
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+    def confidence(self, id: str) -> NDArray[np.float32] | None:
+        """``(H, W)`` in [0, 1]; None where the network stated none.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        file = self.folder / "confidence" / f"{id}.png"
+        if not file.exists():
+            return None
+        try:
+            with Image.open(file) as image:
+                return np.asarray(image.convert("L")).astype(np.float32) / np.float32(255)
+        except (OSError, SyntaxError, ValueError) as error:
+            what = f"the confidence cannot be read ({error})"
+            raise UserError(what, file, "run deltas depth again") from error
+
+    def points(self, id: str) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
+        """Points ``(N, 3)`` of a frame's map in the world, and their colours; None without a file.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        file = self.folder / "points" / f"{id}.ply"
+        if not file.exists():
+            return None
+        try:
+            points, colors = read_points_ply(file)
+        except (OSError, ValueError) as error:
+            what = f"the points cannot be read ({error})"
+            raise UserError(what, file, "run deltas depth again") from error
+        return points.astype(np.float64), colors
+
+
+def open_maps(capture: Capture, folder: Path) -> Maps:
+    """The maps of a capture; those that are missing are named in a warning.
+
+    Args:
+        capture: as it was opened for `deltas depth`, whatever scale it had there.
+        folder: that `deltas depth` filled.
+
+    Raises:
+        UserError: the folder is none of `deltas depth`, its maps are of another capture, or there
+            is not a single one.
+    """
+    anchors = [views.anchor for views in recorded_view_sets(folder)]
+    summary = read_summary(folder / SUMMARY) or {}
+    capture = _as_recorded(capture, folder, summary)
+    wanted = set(anchors)
+    known = [id for id in capture.frames if id in wanted]
+    if not known:
+        what = f"the capture has none of the frames of the maps ({ids_in_words(anchors)})"
+        raise UserError(what, folder, "name the capture that the maps were made of")
+    ids = tuple(id for id in known if _map_exists(folder, id))
+    missing = tuple(id for id in known if not _map_exists(folder, id))
+    if not ids:
+        raise UserError("there is no depth map", folder / "depth", "run deltas depth first")
+    if missing:
+        warn(f"{len(missing)} of {len(known)} maps are missing: {ids_in_words(missing)}")
+    return Maps(folder, capture, ids, missing, summary, recorded_depth_scale(folder))
+
+
+def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> Capture:
+    factor = summary.get("scaled_by", 1.0)
+    if isinstance(factor, int | float) and factor > 0 and factor != capture.scaled_by:
+        metric = summary.get("unit", METRE) == METRE
+        capture = scaled(capture, factor / capture.scaled_by, metric=metric)
+    recorded = summary["settings"].get("capture")
+    cameras = recorded.get("cameras") if isinstance(recorded, dict) else None
+    if cameras is not None and cameras != capture.fingerprint():
+        raise UserError(
+            "the maps are of other cameras than the capture has",
+            folder,
+            "name the capture that they were made of, with the same --intrinsics",
+        )
+    return capture
+
+
+def _map_exists(folder: Path, id: str) -> bool:
+    return any((folder / "depth" / f"{id}.{name}").exists() for name in DEPTH_FORMATS)

@@ -1,0 +1,134 @@
+"""What is there to see in three dimensions: layers of surfaces, and cameras."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from deltas_geom import Lens
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.page.maps import Maps
+from deltas_nets.page.pictures import spread
+from deltas_nets.page.surfaces import Surface, read_surface, thinned
+
+__all__ = ["Camera", "Layer", "camera_of", "layers_of", "sparse_layer", "up_of"]
+
+MOST_POINTS, MOST_FACES = 200_000, 200_000
+"""Of a page: 9 bytes a point and 15 a face, a third more in base64."""
+SURE = 0.5
+"""Confidence from which points of maps are shown."""
+MAPS_OF_CLOUD, POINTS_OF_MAP = 120, 30_000
+"""At most so many maps are read for their points, and so many points of each."""
+
+
+class Layer(NamedTuple):
+    """Something to see, which can be switched on and off.
+
+    Attributes:
+        name: for the switch.
+        surface: points or a mesh.
+    """
+
+    name: str
+    surface: Surface
+
+
+class Camera(NamedTuple):
+    """Where a frame was taken.
+
+    Attributes:
+        id: of the frame.
+        world_from_cam: ``(4, 4)`` rigid, OpenCV axes.
+        slopes: left, top, right, bottom of the image on the plane z = 1.
+    """
+
+    id: str
+    world_from_cam: FloatArray
+    slopes: tuple[float, float, float, float]
+
+
+def camera_of(frame: Frame) -> Camera:
+    """The camera of a frame; a lens is taken for a pinhole, whose outline is straight."""
+    height, width = frame.image_size
+    corners = np.array([[-0.5, width - 0.5], [-0.5, height - 0.5], [1, 1]])
+    (left, right), (top, bottom), _ = np.linalg.solve(frame.K, corners).tolist()
+    R, t = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, :3], world_from_cam[:3, 3] = R.T, -R.T @ t
+    return Camera(frame.id, world_from_cam, (left, top, right, bottom))
+
+
+def up_of(capture: Capture) -> FloatArray:
+    """``(3,)`` where up is for most cameras: people hold them level."""
+    up: FloatArray = -capture.frames.cam_from_world[:, 1, :3].mean(axis=0)
+    length = float(np.linalg.norm(up))
+    return up / length if length > 0.2 else np.array([0.0, -1.0, 0.0])
+
+
+def layers_of(
+    maps: Maps, *, most_points: int = MOST_POINTS, most_faces: int = MOST_FACES
+) -> list[Layer]:
+    """The mesh and the cloud that lie in the folder, else the points of the maps together.
+
+    Raises:
+        UserError: a file cannot be read.
+    """
+    found = []
+    for name, file in (("mesh", "mesh.ply"), ("cloud", "cloud.ply")):
+        if (maps.folder / file).exists():
+            surface = read_surface(maps.folder / file)
+            most = most_points if surface.faces is None else most_faces
+            found.append(Layer(name, thinned(surface, most)))
+    if not found:
+        found.append(Layer("points of the maps", thinned(_points_of_maps(maps), most_points)))
+    return [layer for layer in found if len(layer.surface.xyz)]
+
+
+def sparse_layer(capture: Capture, most_points: int = MOST_POINTS) -> Layer | None:
+    """The points that the capture's own program triangulated; None where there are none."""
+    if capture.points is None or not len(capture.points.xyz):
+        return None
+    surface = Surface(capture.points.xyz, capture.points.rgb)
+    return Layer("sparse points of the capture", thinned(surface, most_points))
+
+
+def _points_of_maps(maps: Maps) -> Surface:
+    xyz, rgb = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    for id in spread(maps.ids, MAPS_OF_CLOUD):
+        read = maps.points(id)
+        if read is None:
+            continue
+        points, colors = read
+        some = slice(None, None, -(-len(points) // POINTS_OF_MAP) or 1)
+        points, colors = points[some], colors[some]
+        sure = _confidence_at(points, maps, id) >= SURE
+        xyz.append(points[sure])
+        rgb.append(colors[sure])
+    return Surface(np.concatenate(xyz), np.concatenate(rgb))
+
+
+def _confidence_at(points: NDArray[np.float64], maps: Maps, id: str) -> NDArray[np.float32]:
+    """``(N,)`` of the pixels of a map that points lie on; 1 where the network stated none."""
+    confidence = maps.confidence(id)
+    if confidence is None or not len(points):
+        return np.ones(len(points), np.float32)
+    frame = maps.capture.frame(id)
+    local = points @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
+    share = np.divide(confidence.shape, frame.image_size)[::-1]
+    pixels = (_pixels(local, frame) + 0.5) * share - 0.5
+    limits = np.array(confidence.shape)[::-1] - 1
+    column, row = np.rint(pixels).clip(0, limits).astype(int).T
+    there: NDArray[np.float32] = confidence[row, column]
+    return there
+
+
+def _pixels(local: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
+    """``(N, 2)`` of points ahead of the camera, in the image file."""
+    if frame.lens is None:
+        return (local @ frame.K[:2].T) / local[:, 2:]
+    coefficients = torch.tensor(frame.lens.coefficients, dtype=torch.float64)
+    lens = Lens(torch.from_numpy(frame.K.copy()), coefficients, frame.lens.model)
+    pixels: NDArray[np.float64] = lens.project(torch.from_numpy(local)).pixels.numpy()
+    return pixels

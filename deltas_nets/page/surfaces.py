@@ -1,0 +1,115 @@
+"""Meshes and clouds: read from PLY files, and made small enough to be shown."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deltas_nets.captures.readers.ply import read_points
+from deltas_nets.errors import UserError
+
+__all__ = ["Surface", "read_surface", "thinned"]
+
+PLAIN = 190
+"""Grey of what has no colours."""
+
+
+class Surface(NamedTuple):
+    """Points, or a mesh of them.
+
+    Attributes:
+        xyz: ``(N, 3)`` in the world.
+        rgb: ``(N, 3)``.
+        faces: ``(M, 3)`` positions of the corners; None where the points are all there is.
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    faces: NDArray[np.int64] | None = None
+
+
+_CORNERS = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+
+
+def read_surface(path: Path) -> Surface:
+    """The vertices of a PLY file and, where it is binary and has them, its triangles.
+
+    Raises:
+        UserError: the file is no PLY file, is cut short, or has faces of another form.
+    """
+    vertices = read_points(path)
+    content = path.read_bytes()
+    header = content[: content.find(b"end_header")].decode("ascii", "replace")
+    elements = [line.split() for line in header.splitlines() if line.startswith("element")]
+    count = next((int(words[2]) for words in elements if words[1:2] == ["face"]), 0)
+    rgb = vertices.rgb
+    if "property uchar red" not in header:
+        rgb = np.full_like(rgb, PLAIN)
+    if count == 0:
+        return Surface(vertices.xyz, rgb)
+    form = "write triangles as binary little-endian PLY: list uchar int vertex_indices"
+    known = "format binary_little_endian" in header and elements[-1][1] == "face"
+    if not known or len(content) < count * _CORNERS.itemsize:
+        raise UserError("the faces cannot be read", path, form)
+    table = np.frombuffer(content[-count * _CORNERS.itemsize :], dtype=_CORNERS)
+    faces = table["corners"].astype(np.int64)
+    if (table["count"] != 3).any() or faces.min() < 0 or faces.max() >= len(vertices.xyz):
+        raise UserError("the faces are not triangles of the file's vertices", path, form)
+    return Surface(vertices.xyz, rgb, faces)
+
+
+def thinned(surface: Surface, most: int) -> Surface:
+    """As much of a surface as may be shown, with points that are close to each other merged.
+
+    Args:
+        surface: points, or a mesh.
+        most: points, or faces of a mesh, that are left at most.
+    """
+    if _size(surface) <= most:
+        return surface
+    low, high = np.percentile(surface.xyz, (2, 98), axis=0)
+    side = float((high - low).max()) or 1.0
+    smallest, largest = side / 4096, 4 * side
+    found = None
+    for _ in range(9):  # halvings of the ratio: the cell is found to a few per cent
+        cell = (smallest * largest) ** 0.5
+        merged = _merged(surface, cell)
+        if _size(merged) <= most:
+            found, largest = merged, cell
+        else:
+            smallest = cell
+    if found is None:  # points so far from each other that no cell holds two
+        keep = np.linspace(0, len(surface.xyz) - 1, most).astype(int)
+        found = Surface(surface.xyz[keep], surface.rgb[keep])
+    return found
+
+
+def _size(surface: Surface) -> int:
+    return len(surface.xyz if surface.faces is None else surface.faces)
+
+
+def _merged(surface: Surface, cell: float) -> Surface:
+    """One point, the mean, for each cell of a grid that holds any."""
+    place = np.floor((surface.xyz - surface.xyz.min(axis=0)) / cell).astype(np.int64)
+    spans = place.max(axis=0) + 1
+    key = (place[:, 0] * spans[1] + place[:, 1]) * spans[2] + place[:, 2]
+    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+
+    def mean(values: NDArray[np.generic]) -> NDArray[np.float64]:
+        sums = [np.bincount(group, column, len(count)) for column in values.T.astype(np.float64)]
+        return np.stack(sums, axis=1) / count[:, None]
+
+    xyz, rgb = mean(surface.xyz), np.rint(mean(surface.rgb)).astype(np.uint8)
+    if surface.faces is None:
+        return Surface(xyz, rgb)
+    faces = group[surface.faces]
+    a, b, c = faces.T
+    faces = np.unique(_turned(faces[(a != b) & (b != c) & (c != a)]), axis=0)
+    return Surface(xyz, rgb, faces)
+
+
+def _turned(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles that begin with their smallest corner, so that equal ones are equal."""
+    first = faces.argmin(axis=1)[:, None]
+    return np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
