@@ -60,8 +60,13 @@ def reach_of(depths: ArrayLike, *, metric: bool) -> Reach:
 
 
 def reach_within(near: float, far: float, *, metric: bool) -> Reach:
-    """A search in a range that is known, in the capture's unit."""
-    return Reach(near, far, _unit(2 / (1 / near + 1 / far), metric))
+    """A search of all of a range that a capture states, in its unit.
+
+    A narrow one is searched as a room is: depth of three captures without metres is better so, and
+    depth in metres does not depend on the format that the capture came in.
+    """
+    unit = _unit(2 / (1 / near + 1 / far), metric)
+    return Reach(min(ROOM[0] / unit, near), max(ROOM[1] / unit, far), unit)
 
 
 def _unit(median: float, metric: bool) -> float:

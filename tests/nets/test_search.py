@@ -132,12 +132,14 @@ def test_sparse_points_spare_the_first_look(capture: Capture, seen: bool) -> Non
     assert points is not None and np.allclose(points[:, 2], 0.3)
 
 
-def test_a_range_that_the_capture_states_is_searched(capture: Capture) -> None:
-    stated = np.tile([0.2, 0.6], (len(capture.frames), 1))
-    oracle = Oracle(0.3)
-    found = Followed(replace(capture, depth_ranges=stated))(oracle, VIEWS, PredictConfig())
-    assert len(oracle.asked) == 1 and found.reach[:2] == (0.2, 0.6)
-    assert np.allclose(found.map.depth, 0.3)
+def test_a_range_that_the_capture_states_is_searched_as_part_of_a_room(capture: Capture) -> None:
+    for stated, searched in (((0.2, 0.6), (0.06, 1.2)), ((2, 4), (0.5, 10)), ((1, 12), (0.5, 12))):
+        ranges = np.tile(stated, (len(capture.frames), 1))
+        oracle = Oracle(2.0 if stated[0] > 0.2 else 0.3)
+        found = Followed(replace(capture, depth_ranges=ranges))(oracle, VIEWS, PredictConfig())
+        assert len(oracle.asked) == 1
+        assert found.reach[:2] == pytest.approx(searched)
+        assert np.allclose(found.map.depth, oracle.wall)
 
 
 def test_a_sensor_is_asked_where_points_pile_up(

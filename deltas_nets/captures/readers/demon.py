@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame
-from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.images import image_size_of
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.intrinsics import read_intrinsics
 from deltas_nets.captures.readers.numbered import numbered_files
-from deltas_nets.captures.readers.poses import cam_from_world, missing_images
+from deltas_nets.captures.readers.poses import cam_from_world
 from deltas_nets.captures.text_lines import read_lines
 from deltas_nets.errors import UserError
 
@@ -33,35 +33,18 @@ def read(path: Path) -> Capture:
     depths = numbered_files(path, (".npy",))
     sizes = (image_size_of(image) for image in images.values())
     K = read_intrinsics(path / "cam.txt", next((size for size in sizes if size), None))
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
+    found = Collected(path)
     for number in sorted(images.keys() | set(range(len(rows)))):
         id = f"{number:04d}"
         if number >= len(rows):
             what = f"frame {id} has no pose"
-            lost[id] = Lost("no pose", UserError(what, file, _REMEDY))
+            found.without_pose(id, UserError(what, file, _REMEDY))
             continue
-        size = image_size_of(images[number]) if number in images else None
-        if size is None:
-            missing.append(id)
-            continue
-        pose = cam_from_world(rows[number].reshape(3, 4), id=id, path=file)
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
-        frames.append(
-            Frame(
-                id=id,
-                image_path=images[number],
-                image_size=size,
-                K=K,
-                cam_from_world=pose,
-                depth_path=depths.get(number),
-            )
-        )
-    lost |= missing_images(missing, path)
-    return Capture(path, Frames.of(frames, path), lost, layout="DeMoN", metric=True)
+        photo = found.photo(id, images.get(number))
+        if photo is not None:
+            pose = cam_from_world(rows[number].reshape(3, 4), id=id, path=file)
+            found.add(photo, pose, K, depth=depths.get(number))
+    return found.capture(path, "DeMoN", metric=True)
 
 
 def _rows(path: Path) -> FloatArray:

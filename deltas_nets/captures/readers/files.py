@@ -15,6 +15,7 @@ NOT_COLOUR = ("depth", "mask", "normal", "confidence", "semantic", "segment", ".
 """How names of folders begin in which no colour image is looked for."""
 FILES_LIMIT = 10**6
 """Files that a folder may hold where names are searched in it."""
+_EMPTY: frozenset[str] = frozenset()
 
 
 class FileFinder:
@@ -52,6 +53,7 @@ class FileFinder:
         self.roots = [root for root in (*roots, folder) if root.is_dir()]
         self.suffixes = tuple(suffixes)
         self.avoid = tuple(avoid)
+        self._folders: dict[str, frozenset[str]] = {}
 
     def find(self, name: str) -> Path | None:
         """The file for a name; None where there is none, or no telling which."""
@@ -67,12 +69,25 @@ class FileFinder:
         up = ".." in relative.split("/")
         suffixes = ("",) if relative.lower().endswith(self.suffixes) else self.suffixes
         # Strings, not paths, which take ten times as long where a million names are asked for.
+        above, _, last = relative.rpartition("/")
         for root in self._names_of_roots[-1:] if up else self._names_of_roots:
+            listed = self._listed(f"{root}/{above}")
             for suffix in suffixes:
+                if last + suffix not in listed:
+                    continue
                 file = os.path.join(root, relative + suffix)
                 if _is_file(file) and (not up or self._is_around(file)):
                     return Path(file)
         return None
+
+    def _listed(self, folder: str) -> frozenset[str]:
+        """What a folder holds; each is listed once, and none is where there is no folder."""
+        if folder not in self._folders:
+            try:
+                self._folders[folder] = frozenset(os.listdir(folder))
+            except (OSError, ValueError):  # not there, a name too long, or with a NUL
+                self._folders[folder] = _EMPTY
+        return self._folders[folder]
 
     @cached_property
     def _names_of_roots(self) -> list[str]:

@@ -14,6 +14,7 @@ __all__ = ["Fields", "read_json"]
 
 JSON_LIMIT = 256 * 2**20
 """Bytes. Python takes ten times as much to hold what a file says."""
+_LARGE = 2**63
 
 
 def read_json(path: Path, *, name: str, remedy: str, limit: int = JSON_LIMIT) -> object:
@@ -130,8 +131,11 @@ class Fields:
         found = self.values.get(key)
         if default is not None and found is None:
             return default
+        # In most cases; the rest need not be quick.
+        if type(found) is int and -_LARGE < found < _LARGE:
+            return float(found)
         if isinstance(found, float) and math.isfinite(found):
-            return found  # in most cases; the rest need not be quick
+            return found
         return float(self.numbers(key, ())[()])
 
     def numbers(self, key: str, shape: tuple[int, ...], *, finite: bool = True) -> FloatArray:

@@ -1,22 +1,23 @@
 """kapture: sensors, records_camera and trajectories in the folder sensors."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from deltas_geom.cameras.lenses.models import MODELS
-from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame, Lens
-from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray, Lens
 from deltas_nets.captures.points import Observations, SparsePoints
-from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
+from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
-from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.names import frame_ids
-from deltas_nets.captures.readers.poses import cam_from_world, missing_images, rigid
+from deltas_nets.captures.readers.poses import cam_from_world, rigid
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
@@ -63,54 +64,27 @@ def read(path: Path) -> Capture:
     rows = list(_rows(records, 3))
     ids = frame_ids([words[2] for _, words in rows], records)
     finder = FileFinder(path, (folder / "records_data",))
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
-    sized: list[SizedCamera] = []
+    found = Collected(records)
     for id, (number, (stamp, device, name, *_)) in zip(ids, rows, strict=True):
         if device not in sensors:
             what = (
                 f"line {number} is of the sensor {device[:40]!r}, which is no camera that is read"
             )
             raise UserError(what, records, "calibrate it: sensors.txt takes models of COLMAP's")
-        image = finder.find(name)
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
+        photo = found.photo(id, finder.find(name))
+        if photo is None:
             continue
         matrix = _cam_from_world(stamp, device, poses, rigs)
         if matrix is None:
             what = f"frame {id} has no pose"
             remedy = "add it to the trajectories, or take the frame out of the view sets"
-            lost[id] = Lost("no pose", UserError(what, folder / "trajectories.txt", remedy))
+            found.without_pose(id, UserError(what, folder / "trajectories.txt", remedy))
             continue
         pose = cam_from_world(matrix, id=id, path=folder / "trajectories.txt")
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
         sensor = sensors[device]
-        sized.append(fitted(sensor.K, sensor.size, size, image=image))
-        frames.append(
-            Frame(
-                id=id,
-                image_path=image,
-                image_size=size,
-                K=sized[-1].K,
-                lens=sensor.lens,
-                cam_from_world=pose,
-            )
-        )
-    lost |= missing_images(missing, records)
-    points = _points(path / "reconstruction" / "points3d.txt")
-    return Capture(
-        path,
-        Frames.of(frames, path),
-        lost,
-        tuple(doubts_of_sizes(sized)),
-        "kapture",
-        metric=False,
-        points=points,
-    )
+        found.add(photo, pose, sensor.K, stated=sensor.size, lens=sensor.lens)
+    capture = found.capture(path, "kapture", metric=False)
+    return replace(capture, points=_points(path / "reconstruction" / "points3d.txt"))
 
 
 def _folder(path: Path) -> Path | None:
@@ -219,10 +193,24 @@ def _points(path: Path) -> SparsePoints | None:
     """Points without their observations, whose pixels kapture keeps in binary files of features."""
     if not path.is_file():
         return None
-    rows = [_numbers(words[:6], line, path) for line, words in _rows(path, 6)]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    table = _table(path)
     table = table[np.isfinite(table).all(axis=1)]
     if not len(table):
         return None
     rgb = table[:, 3:].clip(0, 255).astype(np.uint8)
     return SparsePoints(table[:, :3], rgb, np.full(len(table), np.nan), Observations.none())
+
+
+def _table(path: Path) -> FloatArray:
+    """``(P, 6)``."""
+    text = read_text(path, name="table", remedy=_REMEDY)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            table = np.loadtxt(StringIO(text), comments="#", delimiter=",", ndmin=2)
+        if table.size == 0 or table.shape[1] == 6:
+            return table.reshape(-1, 6)
+    except ValueError:
+        pass
+    # A line that is malformed, which this names, or has more values.
+    rows = [_numbers(words[:6], line, path) for line, words in _rows(path, 6)]
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)

@@ -1,18 +1,20 @@
 """MVSNet's folders: cams/00000000_cam.txt, images/00000000.jpg and pair.txt."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of, in_words
+from deltas_nets.captures.images import in_words
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.numbered import numbered_files
-from deltas_nets.captures.readers.poses import cam_from_world, missing_images
+from deltas_nets.captures.readers.poses import cam_from_world
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
@@ -48,52 +50,32 @@ def read(path: Path) -> Capture:
     if folder is None:
         raise UserError("there is no camera 00000000_cam.txt", path / "cams", _REMEDY)
     cameras = _numbered_cameras(folder)
-    images = next((found for name in _IMAGES if (found := _files(path / name, _SUFFIXES))), {})
-    depths = next((found for name in _DEPTHS if (found := _files(path / name, (".pfm",)))), {})
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing, ranges = [], {}
+    images = next((files for name in _IMAGES if (files := _files(path / name, _SUFFIXES))), {})
+    depths = next((files for name in _DEPTHS if (files := _files(path / name, (".pfm",)))), {})
+    found = Collected(path)
+    ranges: dict[str, tuple[float, float] | None] = {}
     rescaled: set[float] = set()
     for number, file in cameras.items():
         id = f"{number:08d}"
-        size = image_size_of(images[number]) if number in images else None
-        if size is None:
-            missing.append(id)
+        photo = found.photo(id, images.get(number))
+        if photo is None:
             continue
         camera = _camera(file)
         pose = cam_from_world(camera.cam_from_world, id=id, path=file)
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
-        K, scale = _of_size(camera.K, size, file)
+        K, scale = _of_size(camera.K, photo.size, file)
         rescaled |= {scale} - {1.0}
         ranges[id] = camera.depths
-        frames.append(
-            Frame(
-                id=id,
-                image_path=images[number],
-                image_size=size,
-                K=K,
-                cam_from_world=pose,
-                depth_path=depths.get(number),
-            )
-        )
-    lost |= missing_images(missing, path)
-    packed = Frames.of(frames, path)
+        found.add(photo, pose, K, depth=depths.get(number))
     doubts = [
         f"intrinsics are taken to be of images {1 / scale:g} times as large, {folder}"
         for scale in sorted(rescaled)
     ]
-    stated = [ranges[id] for id in packed]
+    capture = found.capture(path, "MVSNet", metric=False, doubts=doubts)
+    stated = [ranges[id] for id in capture.frames]
     known = [depths for depths in stated if depths is not None]
-    return Capture(
-        path,
-        packed,
-        lost,
-        tuple(doubts),
-        "MVSNet",
-        metric=False,
-        sources=_sources(path, folder, packed),
+    return replace(
+        capture,
+        sources=_sources(path, folder, capture.frames),
         depth_ranges=np.array(known).reshape(-1, 2) if len(known) == len(stated) else None,
     )
 

@@ -1,22 +1,21 @@
 """OpenMVG: sfm_data.json, wherever it lies, and the images that it names."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame, Lens
-from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
+from deltas_nets.captures.frame import FloatArray, Lens
 from deltas_nets.captures.points import SparsePoints
-from deltas_nets.captures.readers.cameras import camera_matrix, fitted
+from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
-from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.names import frame_ids, name_parts
-from deltas_nets.captures.readers.poses import cam_from_world, missing_images, rigid
+from deltas_nets.captures.readers.poses import cam_from_world, rigid
 from deltas_nets.captures.readers.sparse import observed
 from deltas_nets.errors import UserError
 
@@ -64,49 +63,20 @@ def read(path: Path) -> Capture:
     finder = FileFinder(folder, _image_folders(scene, folder, file))
     cameras = _cameras(scene)
     poses = dict(_items(scene, "extrinsics"))
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
-    sized: list[SizedCamera] = []
+    found = Collected(file)
     for view, id in zip(views, ids, strict=True):
         if view.pose not in poses or view.intrinsic not in cameras:
             what = f"frame {id} has no pose: OpenMVG could not place it"
-            lost[id] = Lost("no pose", UserError(what, file, "take it out of the view sets"))
+            found.without_pose(id, UserError(what, file, "take it out of the view sets"))
             continue
-        image = finder.find(view.name)
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
-            continue
-        pose = _pose(poses[view.pose], id)
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
-        K, lens = cameras[view.intrinsic]
-        sized.append(fitted(K, view.size, size, image=image))
-        frames.append(
-            Frame(
-                id=id,
-                image_path=image,
-                image_size=size,
-                K=sized[-1].K,
-                lens=lens,
-                cam_from_world=pose,
-            )
-        )
-    lost |= missing_images(missing, file)
-    packed = Frames.of(frames, folder)
-    place = {id: position for position, id in enumerate(packed)}
+        photo = found.photo(id, finder.find(view.name))
+        if photo is not None:
+            K, lens = cameras[view.intrinsic]
+            found.add(photo, _pose(poses[view.pose], id), K, stated=view.size, lens=lens)
+    capture = found.capture(folder, "OpenMVG", metric=False)
+    place = {id: position for position, id in enumerate(capture.frames)}
     position = {view.key: place[id] for view, id in zip(views, ids, strict=True) if id in place}
-    return Capture(
-        folder,
-        packed,
-        lost,
-        tuple(doubts_of_sizes(sized)),
-        "OpenMVG",
-        metric=False,
-        points=_points(scene, position),
-    )
+    return replace(capture, points=_points(scene, position))
 
 
 def _head(path: Path) -> bytes:

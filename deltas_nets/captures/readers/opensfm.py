@@ -1,23 +1,22 @@
 """OpenSfM: reconstruction.json beside the folder images, and tracks.csv if it is there."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame, Lens
+from deltas_nets.captures.frame import FloatArray, Lens
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.points import Observations, SparsePoints
-from deltas_nets.captures.readers.cameras import camera_matrix, fitted
+from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
-from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.names import frame_ids
 from deltas_nets.captures.readers.poses import (
     cam_from_world,
-    missing_images,
     rigid,
     rotation_of_vector,
 )
@@ -53,10 +52,10 @@ def read(path: Path) -> Capture:
     if file is None:
         raise UserError("there is no reconstruction.json", path, _REMEDY)
     folder = file.parent
-    found = read_json(file, name="reconstruction", remedy=_REMEDY)
+    content = read_json(file, name="reconstruction", remedy=_REMEDY)
     each = [
         Fields(item, file, where="a reconstruction", remedy=_REMEDY)
-        for item in (found if isinstance(found, list) else [found])
+        for item in (content if isinstance(content, list) else [content])
     ]
     if not each:
         raise UserError("the file holds no reconstruction", file, _REMEDY)
@@ -66,52 +65,24 @@ def read(path: Path) -> Capture:
     ids = dict(zip(names, frame_ids(names, file), strict=True))
     finder = FileFinder(folder, (folder / "images", folder.parent / "images"))
     cameras = _cameras(best)
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
-    sized: list[SizedCamera] = []
+    found = Collected(file)
     for name, id in ids.items():
         shot = shots.inner(name)
-        image = finder.find(name)
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
-            continue
-        pose = _pose(shot, id)
-        if isinstance(pose, Lost):
-            lost[id] = pose
+        photo = found.photo(id, finder.find(name))
+        if photo is None:
             continue
         called = shot.text("camera")
         if called not in cameras:
             raise shot.error(f"is of the camera {called[:60]!r}, which there is not")
         stated, K, lens = cameras[called]
-        sized.append(fitted(K, stated, size, image=image))
-        frames.append(
-            Frame(
-                id=id,
-                image_path=image,
-                image_size=size,
-                K=sized[-1].K,
-                lens=lens,
-                cam_from_world=pose,
-            )
-        )
-    lost |= missing_images(missing, file)
-    doubts = doubts_of_sizes(sized)
+        found.add(photo, _pose(shot, id), K, stated=stated, lens=lens)
+    doubts = []
     if len(each) > 1:
         doubts.append(
             f"the largest of {len(each)} reconstructions is read, with {len(names)} images, {file}"
         )
-    packed = Frames.of(frames, folder)
-    return Capture(
-        folder,
-        packed,
-        lost,
-        tuple(doubts),
-        "OpenSfM",
-        metric=False,
-        points=_points(best, folder, packed, ids),
-    )
+    capture = found.capture(folder, "OpenSfM", metric=False, doubts=doubts)
+    return replace(capture, points=_points(best, folder, capture.frames, ids))
 
 
 def _head(path: Path) -> bytes:

@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame
-from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
-from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
-from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.json_file import Fields, read_json
-from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, missing_images
+from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "recognises"]
@@ -37,46 +35,34 @@ def read(path: Path) -> Capture:
     doubts = []
     if cameras.name == "cameras":
         doubts.append(f"poses are as tracked, not optimised (no corrected_cameras), {folder}")
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
-    sized: list[SizedCamera] = []
+    found = Collected(images)
     files = sorted(file for file in cameras.iterdir() if file.suffix.lower() == ".json")
     for file in files:
         id = file.stem
         image = next(
             (
-                found
+                image
                 for suffix in (".jpg", ".jpeg", ".png")
-                if (found := images / f"{id}{suffix}").is_file()
+                if (image := images / f"{id}{suffix}").is_file()
             ),
             None,
         )
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
+        photo = found.photo(id, image)
+        if photo is None:
             continue
         content = read_json(file, name="camera", remedy=_REMEDY, limit=_JSON_LIMIT)
         fields = Fields(content, file, where="the camera", remedy=_REMEDY)
-        pose = _pose(fields, id, file)
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
-        sized.append(_intrinsics(fields, size, image))
+        height, width = photo.size
+        stated = int(fields.number("height", height)), int(fields.number("width", width))
         depth = folder / "depth" / f"{id}.png"
-        frames.append(
-            Frame(
-                id=id,
-                image_path=image,
-                image_size=size,
-                K=sized[-1].K,
-                cam_from_world=pose,
-                depth_path=depth if depth.is_file() else None,
-            )
+        found.add(
+            photo,
+            _pose(fields, id, file),
+            _K(fields),
+            stated=stated,
+            depth=depth if depth.is_file() else None,
         )
-    lost |= missing_images(missing, images)
-    doubts += doubts_of_sizes(sized)
-    return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "Polycam", metric=True)
+    return found.capture(path, "Polycam", metric=True, doubts=doubts)
 
 
 def _keyframes(path: Path) -> tuple[Path, Path] | None:
@@ -93,12 +79,10 @@ def _holds_json(folder: Path) -> bool:
     return any(file.suffix.lower() == ".json" for file in folder.iterdir())
 
 
-def _intrinsics(fields: Fields, size: tuple[int, int], image: Path) -> SizedCamera:
+def _K(fields: Fields) -> FloatArray:
     """ARKit measures the principal point from the corner of the image."""
     fx, fy, cx, cy = (fields.number(name) for name in ("fx", "fy", "cx", "cy"))
-    K = camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=fields.path)
-    stated = int(fields.number("height", size[0])), int(fields.number("width", size[1]))
-    return fitted(K, stated, size, image=image)
+    return camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=fields.path)
 
 
 def _pose(fields: Fields, id: str, path: Path) -> FloatArray | Lost:

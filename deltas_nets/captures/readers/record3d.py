@@ -5,14 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import FloatArray, Frame
-from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
-from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
-from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
+from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.numbered import numbered_files
-from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, missing_images, rigid
+from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, rigid
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
@@ -42,40 +40,19 @@ def read(path: Path) -> Capture:
     of_each = _intrinsics(fields, len(poses))
     images = numbered_files(folder / "rgb", (".jpg", ".jpeg", ".png"))
     depths = numbered_files(folder / "depth", (".exr",))
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
-    sized: list[SizedCamera] = []
+    found = Collected(folder / "rgb")
     for number in range(len(poses)):
         id = str(number)
-        size = image_size_of(images[number]) if number in images else None
-        if size is None:
-            missing.append(id)
-            continue
-        pose = _pose(poses[number], id, file)
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
-        K = camera_matrix(*of_each[number].tolist(), path=file)
-        sized.append(fitted(K, stated, size, image=images[number]))
-        frames.append(
-            Frame(
-                id=id,
-                image_path=images[number],
-                image_size=size,
-                K=sized[-1].K,
-                cam_from_world=pose,
-                depth_path=depths.get(number),
-            )
-        )
-    lost |= missing_images(missing, folder / "rgb")
-    doubts = doubts_of_sizes(sized)
+        photo = found.photo(id, images.get(number))
+        if photo is not None:
+            pose = _pose(poses[number], id, file)
+            K = camera_matrix(*of_each[number].tolist(), path=file)
+            found.add(photo, pose, K, stated=stated, depth=depths.get(number))
+    doubts = []
     without = len(images.keys() - set(range(len(poses))))
     if without:
         doubts.append(f"{without} images have no pose and are left out, {file}")
-    return Capture(
-        folder, Frames.of(frames, folder), lost, tuple(doubts), "Record3D EXR", metric=True
-    )
+    return found.capture(folder, "Record3D EXR", metric=True, doubts=doubts)
 
 
 def _folder(path: Path) -> Path | None:

@@ -1,17 +1,17 @@
 """The sample of the Robust MVD benchmark: a key image and its sources, each in a folder."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.float_files import read_npy_array
-from deltas_nets.captures.frame import FloatArray, Frame
-from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import natural_key
-from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.cameras import camera_matrix
-from deltas_nets.captures.readers.poses import cam_from_world, missing_images
+from deltas_nets.captures.readers.collected import Collected
+from deltas_nets.captures.readers.poses import cam_from_world
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "recognises"]
@@ -38,16 +38,13 @@ def read(path: Path) -> Capture:
     }
     if len(folders) != len(sources) + 1:
         raise UserError("a source is called key", path / "source", "call it by a number")
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing = []
+    found = Collected(path)
     for id, folder in folders.items():
         image = next(
             (file for name in ("image.png", "image.jpg") if (file := folder / name).is_file()), None
         )
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
+        photo = found.photo(id, image)
+        if photo is None:
             continue
         K = _matrix(folder / "K.npy", 3)
         pose = cam_from_world(
@@ -55,31 +52,17 @@ def read(path: Path) -> Capture:
             id=id,
             path=folder / "to_ref_transform.npy",
         )
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
         depth = folder / "depth.npy"
-        frames.append(
-            Frame(
-                id=id,
-                image_path=image,
-                image_size=size,
-                K=camera_matrix(K[0, 0], K[1, 1], K[0, 2], K[1, 2], path=folder / "K.npy"),
-                cam_from_world=pose,
-                depth_path=depth if depth.is_file() else None,
-            )
+        found.add(
+            photo,
+            pose,
+            camera_matrix(K[0, 0], K[1, 1], K[0, 2], K[1, 2], path=folder / "K.npy"),
+            depth=depth if depth.is_file() else None,
         )
-    lost |= missing_images(missing, path)
-    known = [frame.id for frame in frames]
-    of_key = tuple(id for id in known if id != "key")
-    return Capture(
-        path,
-        Frames.of(frames, path),
-        lost,
-        layout="Robust MVD",
-        metric=True,
-        sources={"key": of_key} if "key" in known and of_key else None,
-    )
+    capture = found.capture(path, "Robust MVD", metric=True)
+    of_key = tuple(id for id in folders if id in capture.frames and id != "key")
+    together = {"key": of_key} if "key" in capture.frames and of_key else None
+    return replace(capture, sources=together)
 
 
 def _matrix(path: Path, side: int) -> FloatArray:

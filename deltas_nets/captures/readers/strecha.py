@@ -5,15 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from deltas_nets.captures.capture import Capture, Lost
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
-from deltas_nets.captures.readers.cameras import camera_matrix, fitted
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
-from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.names import frame_ids
-from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images, rigid
+from deltas_nets.captures.readers.poses import cam_from_world_of, rigid
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
@@ -33,15 +30,10 @@ def read(path: Path) -> Capture:
     names = [file.name.removesuffix(".camera") for file in files]
     ids = frame_ids(names, files[0].parent) if files else []
     finder = FileFinder(path, (files[0].parent, path / "images")) if files else FileFinder(path)
-    frames: list[Frame] = []
-    lost: dict[str, Lost] = {}
-    missing, bent = [], 0
-    sized: list[SizedCamera] = []
+    found, bent = Collected(path), 0
     for file, name, id in zip(files, names, ids, strict=True):
-        image = finder.find(name) or finder.find(Path(name).stem)
-        size = None if image is None else image_size_of(image)
-        if image is None or size is None:
-            missing.append(id)
+        photo = found.photo(id, finder.find(name) or finder.find(Path(name).stem))
+        if photo is None:
             continue
         numbers = np.array(read_numbers(file, name="camera", remedy=_REMEDY))
         if len(numbers) != 26:
@@ -50,28 +42,15 @@ def read(path: Path) -> Capture:
         K, bends, rotation, centre, sides = np.split(numbers, (9, 12, 21, 24))
         bent += bool(bends.any())
         pose = cam_from_world_of(rigid(rotation.reshape(3, 3), centre), id=id, path=file)
-        if isinstance(pose, Lost):
-            lost[id] = pose
-            continue
         if not (np.isfinite(sides).all() and (sides >= 1).all()):
             raise UserError("the camera's width and height are no sizes", file, _REMEDY)
         stated = int(sides[1]), int(sides[0])
         matrix = camera_matrix(K[0], K[4], K[2], K[5], path=file)
-        sized.append(fitted(matrix, stated, size, image=image))
-        frames.append(
-            Frame(
-                id=id,
-                image_path=image,
-                image_size=size,
-                K=sized[-1].K,
-                cam_from_world=pose,
-            )
-        )
-    lost |= missing_images(missing, path)
-    doubts = doubts_of_sizes(sized)
+        found.add(photo, pose, matrix, stated=stated)
+    doubts = []
     if bent:
         doubts.append(f"{bent} cameras state a distortion, which is not undone, {path}")
-    return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "Strecha", metric=False)
+    return found.capture(path, "Strecha", metric=False, doubts=doubts)
 
 
 def _cameras(path: Path) -> Sequence[Path]:
