@@ -120,7 +120,7 @@ def _round_ratios(scale: Scale) -> list[float]:
 def _round_steps(scale: Scale) -> list[float]:
     span = scale.high - scale.low
     power = 10.0 ** math.floor(math.log10(span))
-    steps = [power * part for part in (0.1, 0.2, 0.5, 1)]
+    steps = [power * part for part in (0.2, 0.5, 1, 2)]
     step = next(step for step in steps if span / step < MOST_TICKS)
     counts = range(math.ceil(scale.low / step - 1e-9), math.floor(scale.high / step + 1e-9) + 1)
     return [round(count * step, 12) for count in counts]

@@ -130,7 +130,7 @@ function sceneIn(canvas, { up, layers, cameras }, onCamera) {
 
   function reset() {
     const target = low.map((x, axis) => (x + high[axis]) / 2);
-    Object.assign(view, { yaw: 0.35, pitch: 0.5, distance: 1.7 * radius, target, slope: 0.5 });
+    Object.assign(view, { yaw: 0.35, pitch: 0.5, distance: 1.8 * radius, target, slope: 0.5 });
     changed();
   }
 

@@ -19,6 +19,7 @@ MOST_POINTS, MOST_FACES = 200_000, 200_000
 """Of a page: 9 bytes a point and 15 a face, a third more in base64."""
 SURE = 0.5
 """Confidence from which points of maps are shown."""
+SMALLEST_DEPTH = 1e-9
 MAPS_OF_CLOUD, POINTS_OF_MAP = 120, 30_000
 """At most so many maps are read for their points, and so many points of each."""
 
@@ -127,7 +128,7 @@ def _confidence_at(points: NDArray[np.float64], maps: Maps, id: str) -> NDArray[
 def _pixels(local: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
     """``(N, 2)`` of points ahead of the camera, in the image file."""
     if frame.lens is None:
-        return (local @ frame.K[:2].T) / local[:, 2:]
+        return (local @ frame.K[:2].T) / np.maximum(local[:, 2:], SMALLEST_DEPTH)
     coefficients = torch.tensor(frame.lens.coefficients, dtype=torch.float64)
     lens = Lens(torch.from_numpy(frame.K.copy()), coefficients, frame.lens.model)
     pixels: NDArray[np.float64] = lens.project(torch.from_numpy(local)).pixels.numpy()

@@ -13,6 +13,12 @@ __all__ = ["Surface", "read_surface", "thinned"]
 
 PLAIN = 190
 """Grey of what has no colours."""
+ROUNDS, MOST_OF_IT = 8, 0.6
+"""Cells that are tried, and the share of what is allowed that is enough."""
+SMALLEST = 1e-9
+"""Side of a box around points that are all in one place."""
+FAR = 4
+"""Times the side of a box around most points; what is farther from the middle is left out."""
 
 
 class Surface(NamedTuple):
@@ -60,29 +66,52 @@ def read_surface(path: Path) -> Surface:
 
 
 def thinned(surface: Surface, most: int) -> Surface:
-    """As much of a surface as may be shown, with points that are close to each other merged.
+    """As much of a surface as may be shown: without what is far away from all the rest.
+
+    Points that are close to each other are merged, in a grid that is as fine as there may be
+    points.
 
     Args:
         surface: points, or a mesh.
         most: points, or faces of a mesh, that are left at most.
     """
+    surface = _without_far(surface)
     if _size(surface) <= most:
         return surface
-    low, high = np.percentile(surface.xyz, (2, 98), axis=0)
-    side = float((high - low).max()) or 1.0
-    smallest, largest = side / 4096, 4 * side
-    found = None
-    for _ in range(9):  # halvings of the ratio: the cell is found to a few per cent
-        cell = (smallest * largest) ** 0.5
+    cell, found = _side(surface.xyz) / most**0.5, None
+    for _ in range(ROUNDS):
         merged = _merged(surface, cell)
-        if _size(merged) <= most:
-            found, largest = merged, cell
-        else:
-            smallest = cell
-    if found is None:  # points so far from each other that no cell holds two
-        keep = np.linspace(0, len(surface.xyz) - 1, most).astype(int)
-        found = Surface(surface.xyz[keep], surface.rgb[keep])
+        count = _size(merged)
+        if count <= most:
+            found = merged
+        if MOST_OF_IT * most <= count <= most:
+            return merged
+        # A surface's points are as many as the inverse square of what they are apart.
+        cell *= 1.05 * (max(count, 1) / most) ** 0.5
+    if found is None:  # no cell holds two of them, or all are in one place
+        found = Surface(*(part[:: -(-len(surface.xyz) // most)] for part in surface[:2]))
     return found
+
+
+def _without_far(surface: Surface) -> Surface:
+    """What is near to where most of it is: the rest would make that a dot."""
+    if not len(surface.xyz):
+        return surface
+    middle, reach = np.median(surface.xyz, axis=0), FAR * _side(surface.xyz)
+    near = (np.abs(surface.xyz - middle) <= reach).all(axis=1)
+    if near.all():
+        return surface
+    faces = surface.faces
+    if faces is not None:
+        faces = (np.cumsum(near) - 1)[faces[near[faces].all(axis=1)]]
+    return Surface(surface.xyz[near], surface.rgb[near], faces)
+
+
+def _side(xyz: NDArray[np.float64]) -> float:
+    """The longest side of a box around most points."""
+    low, high = np.percentile(xyz, (2, 98), axis=0)
+    side = float((high - low).max()) or float(np.ptp(xyz, axis=0).max())
+    return max(side, SMALLEST)
 
 
 def _size(surface: Surface) -> int:
@@ -105,7 +134,10 @@ def _merged(surface: Surface, cell: float) -> Surface:
         return Surface(xyz, rgb)
     faces = group[surface.faces]
     a, b, c = faces.T
-    faces = np.unique(_turned(faces[(a != b) & (b != c) & (c != a)]), axis=0)
+    faces = _turned(faces[(a != b) & (b != c) & (c != a)])
+    if len(count) < 2**21:  # or the names of triangles overflow; there are too many then anyhow
+        name = (faces[:, 0] * len(count) + faces[:, 1]) * len(count) + faces[:, 2]
+        faces = faces[np.unique(name, return_index=True)[1]]
     return Surface(xyz, rgb, faces)
 
 

@@ -1,0 +1,349 @@
+"""The page beside depth maps: what it says is what the files say, and it stays small."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import MakeCapture
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from PIL import Image
+from run_command import Run, assert_one_line
+from small_maps import write_maps
+
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.errors import UserError
+from deltas_nets.evaluate.capture import evaluate_files
+from deltas_nets.outputs.products import OWN_UNIT, OutputOptions
+from deltas_nets.outputs.summary import recorded_view_sets
+from deltas_nets.page import write
+from deltas_nets.page.budget import choose
+from deltas_nets.page.colours import (
+    CONFIDENCE,
+    ERROR,
+    NONE,
+    Scale,
+    coloured,
+    depth_scale,
+    lookup_table,
+    ticks_of,
+)
+from deltas_nets.page.maps import open_maps
+from deltas_nets.page.scene import camera_of, layers_of
+from deltas_nets.page.surfaces import Surface, read_surface, thinned
+from deltas_nets.page.write import write_page
+
+ODD = "a & b <script>alert(1)<！--</script> \u2028'\""
+"""An id that no page may take for its own words; a file may be called so."""
+
+
+@pytest.fixture
+def filled(make_capture: MakeCapture, tmp_path: Path) -> tuple[Path, Path]:
+    """A capture of four frames and its maps."""
+    capture = make_capture()
+    return capture, write_maps(capture, tmp_path / "maps")
+
+
+def page_of(capture: Path, folder: Path) -> write.Page:
+    return write_page(open_maps(open_capture(capture), folder))
+
+
+def data_of(folder: Path) -> dict[str, Any]:
+    """What the page was given."""
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    found: dict[str, Any] = json.loads(data)
+    return found
+
+
+def mesh_of(folder: Path, corners: int = 40) -> Surface:
+    """A wavy sheet of triangles, written as ``deltas fuse`` does."""
+    x, y = np.meshgrid(np.linspace(0, 1, corners), np.linspace(0, 1, corners))
+    xyz = np.stack([x, y, 0.1 * np.sin(9 * x)], axis=-1).reshape(-1, 3)
+    rgb = np.random.default_rng(0).integers(0, 255, xyz.shape, dtype=np.uint8)
+    a = np.arange(corners * corners).reshape(corners, corners)
+    first = np.stack([a[:-1, :-1], a[1:, :-1], a[:-1, 1:]], axis=-1).reshape(-1, 3)
+    second = np.stack([a[:-1, 1:], a[1:, :-1], a[1:, 1:]], axis=-1).reshape(-1, 3)
+    faces = np.concatenate([first, second])
+    vertices = np.zeros(len(xyz), [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"], vertices["rgb"] = xyz, rgb
+    listed = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    listed["count"], listed["corners"] = 3, faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
+    lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    content = "\n".join([*lines, ""]).encode() + vertices.tobytes() + listed.tobytes()
+    folder.mkdir(exist_ok=True)
+    (folder / "mesh.ply").write_bytes(content)
+    return Surface(vertices["xyz"].astype(np.float64), rgb, faces)
+
+
+# Colours
+
+
+@given(low=st.floats(1e-3, 1e3), ratio=st.floats(1.3, 100), share=st.floats(0, 1))
+def test_a_value_is_read_back_from_its_colour(low: float, ratio: float, share: float) -> None:
+    scale = Scale("turbo_r", low, low * ratio, "m", log=True)
+    value = low * ratio**share
+    colour = coloured(np.array([[value]], np.float32), scale)[0, 0]
+    place = np.square(lookup_table(scale).astype(int) - colour).sum(axis=1).argmin() / 255
+    # Neighbours of turbo's colours are at most a step from the nearest.
+    assert low * ratio**place == pytest.approx(value, rel=2 * np.log(ratio) / 255)
+
+
+@pytest.mark.parametrize("scale", [CONFIDENCE, ERROR, Scale("turbo_r", 1, 2, "m", log=True)])
+def test_no_colour_is_near_the_grey_of_the_unknown(scale: Scale) -> None:
+    far = np.abs(lookup_table(scale).astype(int) - NONE).max(axis=1)
+    assert far.min() > 20  # what a JPEG changes is less
+
+
+@given(low=st.floats(1e-4, 1e5), ratio=st.floats(1.05, 1e4), log=st.booleans())
+def test_ticks_are_few_round_and_where_they_say(low: float, ratio: float, log: bool) -> None:
+    scale = Scale("turbo_r", low, low * ratio, "m", log=log)
+    ticks = ticks_of(scale)
+    assert 2 <= len(ticks) <= 8
+    for place, text in ticks:
+        assert -1e-6 <= place <= 1 + 1e-6
+        assert scale.place(np.array(float(text))) == pytest.approx(place, abs=1e-5)
+
+
+def test_the_scale_of_depth_spans_most_of_it_and_never_nothing() -> None:
+    many = np.geomspace(1, 9, 1000).astype(np.float32)
+    scale = depth_scale(many, "m")
+    assert scale.low == pytest.approx(1, rel=0.05) and scale.high == pytest.approx(9, rel=0.05)
+    for few in (np.array([2.5], np.float32), np.zeros(0, np.float32)):
+        assert depth_scale(few, "m").high > 1.1 * depth_scale(few, "m").low
+
+
+# Surfaces
+
+
+@given(
+    points=arrays.arrays(np.float64, (60, 3), elements=st.floats(-5, 5)), most=st.integers(1, 70)
+)
+def test_thinned_points_are_few_and_among_the_others(points: np.ndarray, most: int) -> None:
+    rgb = np.full((60, 3), 7, np.uint8)
+    found = thinned(Surface(points, rgb), most)
+    assert len(found.xyz) == len(found.rgb) <= most
+    assert (found.xyz >= points.min(axis=0) - 1e-9).all()
+    assert (found.xyz <= points.max(axis=0) + 1e-9).all()
+    assert (found.rgb == 7).all()
+
+
+def test_a_thinned_mesh_keeps_its_shape(tmp_path: Path) -> None:
+    mesh = mesh_of(tmp_path)
+    few = thinned(mesh, 800)
+    assert few.faces is not None and 400 < len(few.faces) <= 800
+    assert few.faces.max() < len(few.xyz)
+    assert (np.diff(np.sort(few.faces, axis=1)) > 0).all()  # three corners each
+    corners = few.xyz[few.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(1.2, rel=0.2)  # m^2
+    assert (normals[:, 2] < 0).all() or (normals[:, 2] > 0).all()  # no face is turned over
+    assert np.abs(few.xyz[:, 2] - 0.1 * np.sin(9 * few.xyz[:, 0])).max() < 0.02  # m
+    assert thinned(mesh, 10**6) is mesh
+
+
+def test_a_point_far_away_does_not_cost_the_rest() -> None:
+    near = np.random.default_rng(0).uniform(0, 1, (500, 3))
+    far = np.concatenate([near, [[1e9, 0, 0]]])
+    found = thinned(Surface(far, np.zeros(far.shape, np.uint8)), 10**6)
+    np.testing.assert_array_equal(found.xyz, near)
+
+
+def test_a_mesh_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    mesh_of(tmp_path)
+    ours, theirs = read_surface(tmp_path / "mesh.ply"), trimesh.load(tmp_path / "mesh.ply")
+    assert ours.faces is not None
+    np.testing.assert_allclose(ours.xyz[ours.faces], theirs.vertices[theirs.faces], atol=1e-6)
+    theirs.export(tmp_path / "again.ply")
+    again = read_surface(tmp_path / "again.ply")
+    np.testing.assert_allclose(again.xyz, theirs.vertices, atol=1e-6)
+
+
+@pytest.mark.parametrize("cut", [1, 5000, 10**6])
+def test_a_mesh_that_is_cut_short_is_refused(tmp_path: Path, cut: int) -> None:
+    mesh_of(tmp_path)
+    file = tmp_path / "mesh.ply"
+    file.write_bytes(file.read_bytes()[:-cut])
+    with pytest.raises(UserError) as error:
+        read_surface(file)
+    assert error.value.where == file
+
+
+# What is shown
+
+
+@given(count=st.integers(1, 3000), room=st.integers(10**5, 10**7), each=st.integers(1000, 400_000))
+def test_frames_are_chosen_to_fit(count: int, room: int, each: int) -> None:
+    ids = list(map(str, range(count)))
+    chosen = choose(ids, room, lambda _, longest: each * longest**2 // 640**2)
+    assert chosen.ids[0] == ids[0] and chosen.ids[-1] == ids[-1]
+    whole = len(chosen.ids) * (each * chosen.longest**2 // 640**2)
+    assert whole <= room or len(chosen.ids) <= 2
+    assert len(chosen.ids) == count or chosen.longest == 320
+
+
+def test_a_camera_sees_what_its_outline_holds(make_capture: MakeCapture) -> None:
+    frame = open_capture(make_capture()).frame("1")
+    camera = camera_of(frame)
+    left, top, right, bottom = camera.slopes
+    corners = np.array([[left, top, 1], [right, bottom, 1]])
+    pixels = (corners @ frame.K.T)[:, :2]
+    np.testing.assert_allclose(pixels, [[-0.5, -0.5], [63.5, 47.5]], atol=1e-9)
+    np.testing.assert_allclose(camera.world_from_cam @ frame.cam_from_world, np.eye(4), atol=1e-9)
+
+
+def test_the_page_holds_every_map_and_needs_nothing_else(filled: tuple[Path, Path]) -> None:
+    capture, folder = filled
+    page = page_of(capture, folder)
+    assert (page.maps, page.shown) == (4, 4) and page.size == page.path.stat().st_size
+    text = page.path.read_text(encoding="utf-8")
+    assert not re.search(r"https?:|//cdn|@import|url\(|<link|\bsrc=", text)
+    data = data_of(folder)
+    assert [frame["id"] for frame in data["frames"]] == ["0", "1", "2", "3"]
+    assert list(data["kinds"]) == ["image", "depth", "confidence", "error", "truth"]
+    assert all(frame["pictures"].keys() == data["kinds"].keys() for frame in data["frames"])
+    assert data["verdict"]["line"].startswith("mean confidence 0.60") and not data["notes"]
+    assert [camera["frame"] for camera in data["scene"]["cameras"]] == [0, 1, 2, 3]
+    with Image.open(folder / "preview" / "2.jpg") as preview:
+        red, _, blue = np.asarray(preview)[24, 0]
+        assert red > blue + 50  # near
+        red, _, blue = np.asarray(preview)[24, 63]
+        assert blue > red  # far
+    with Image.open(folder / "contact_sheet.jpg") as sheet:
+        assert np.asarray(sheet).std() > 20
+
+
+def test_errors_are_those_of_evaluate(filled: tuple[Path, Path]) -> None:
+    capture, folder = filled
+    page_of(capture, folder)
+    facts = {name: value for name, value, _ in data_of(folder)["facts"]}
+    scores = evaluate_files(
+        folder, open_capture(capture), recorded_view_sets(folder), depth_range=(0.5, 10)
+    )
+    assert facts["Abs Rel"] == f"{scores.dense.abs_rel:.3f}" == "0.102"
+    assert facts["δ < 1.25"] == f"{scores.dense.delta1:.3f}"
+
+
+def test_points_of_the_maps_are_shown_where_they_are(filled: tuple[Path, Path]) -> None:
+    capture, folder = filled
+    (layer,) = layers_of(open_maps(open_capture(capture), folder))
+    # The slanted plane z = 2 to 3 before the cameras at x = 0 to 0.45.
+    assert 2.0 <= layer.surface.xyz[:, 2].min() < layer.surface.xyz[:, 2].max() <= 3.0
+    assert layer.surface.xyz[:, 0].max() == pytest.approx(0.45 + 1.5, abs=0.05)
+    mesh_of(folder)
+    (mesh,) = layers_of(open_maps(open_capture(capture), folder))
+    assert mesh.name == "mesh" and mesh.surface.faces is not None
+
+
+def test_unsure_points_are_left_out(filled: tuple[Path, Path]) -> None:
+    capture, folder = filled
+    half = np.zeros((48, 64), np.uint8)
+    half[:, :32] = 255
+    for file in (folder / "confidence").iterdir():
+        Image.fromarray(half).save(file)
+    (layer,) = layers_of(open_maps(open_capture(capture), folder))
+    assert layer.surface.xyz[:, 2].max() < 2.52  # m: what is right of the middle is farther
+
+
+def test_a_page_of_many_maps_stays_small(
+    filled: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture, folder = filled
+    whole = page_of(capture, folder).size
+    monkeypatch.setattr(write, "MOST_BYTES", whole - 8000)
+    page = page_of(capture, folder)
+    assert page.size <= whole - 8000 and page.shown < 4
+    data = data_of(folder)
+    assert f"{page.shown} of 4 maps" in page.line and f"{page.shown} of 4" in data["notes"][0]
+    assert len(data["scene"]["cameras"]) == 4 and len(list((folder / "preview").iterdir())) == 4
+
+
+def test_a_capture_without_metres_sensor_or_confidence(
+    make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    capture = make_capture(depth_size=None)
+    folder = tmp_path / "maps"
+    write_maps(capture, folder, options=OutputOptions(confidence=False, unit=OWN_UNIT))
+    page_of(capture, folder)
+    data = data_of(folder)
+    assert list(data["kinds"]) == ["image", "depth"]
+    assert data["scales"]["depth"]["unit"] == "units" and "no metres" in data["notes"][0]
+
+
+def test_one_frame_and_a_map_without_depth(make_capture: MakeCapture, tmp_path: Path) -> None:
+    capture = make_capture(1)
+    folder = write_maps(capture, tmp_path / "maps", depth=np.zeros)
+    assert page_of(capture, folder).shown == 1
+    assert data_of(folder)["scene"]["layers"] == []
+
+
+def test_ids_are_not_taken_for_the_pages_own_words(
+    make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder = write_maps(make_capture(), tmp_path / "maps")
+    maps = open_maps(open_capture(make_capture(path=tmp_path / "again")), folder)
+    text = json.dumps({ODD: json.loads((folder / "summary.json").read_text())})
+    assert ODD in json.loads(text)
+    frames = [write.shown_frame(write.pictures_of(maps, "0", maps.depth("0"), ERROR, (0.5, 10)))]
+    page = write.html_of(maps, [frames[0]._replace(id=ODD)], [], ERROR, (0.5, 10))
+    (folder / "index.html").write_bytes(page)
+    assert data_of(folder)["frames"][0]["id"] == ODD
+
+
+# What is wrong
+
+
+def test_missing_maps_are_told(filled: tuple[Path, Path], run: Run) -> None:
+    capture, folder = filled
+    (folder / "depth" / "1.png").unlink()
+    result = run("page", capture, folder)
+    assert result.code == 0 and result.warnings == ["1 of 4 maps are missing: 1"]
+    assert "1 maps are missing" in data_of(folder)["notes"][0]
+
+
+@pytest.mark.parametrize("name", ["depth/2.png", "confidence/2.png", "points/2.ply"])
+@pytest.mark.parametrize("content", [b"", b"no picture", -30])
+def test_a_damaged_file_is_named_and_the_page_stays(
+    filled: tuple[Path, Path], run: Run, name: str, content: bytes | int
+) -> None:
+    capture, folder = filled
+    (folder / "index.html").write_text("as it was")
+    file = folder / name
+    file.write_bytes(content if isinstance(content, bytes) else file.read_bytes()[:content])
+    assert_one_line(run("page", capture, folder), name)
+    assert (folder / "index.html").read_text() == "as it was"
+
+
+def test_folders_that_are_none_of_ours(
+    filled: tuple[Path, Path], run: Run, make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    capture, folder = filled
+    assert_one_line(run("page", capture, tmp_path / "nowhere"), "summary.json", "run it first")
+    other = make_capture(path=tmp_path / "other", step=0.2)
+    assert_one_line(run("page", other, folder), "other cameras", "the capture that they were made")
+    shutil.rmtree(folder / "depth")
+    assert_one_line(run("page", capture, folder), "no depth map", "deltas depth first")
+
+
+@pytest.mark.parametrize(
+    "frames", [{}, {"0": 3, "1": {"confidence": "high", "keypoints": 9}, "2": {"sources": 7}}]
+)
+def test_a_summary_of_another_version_says_less(
+    filled: tuple[Path, Path], frames: dict[str, Any]
+) -> None:
+    capture, folder = filled
+    file = folder / "summary.json"
+    settings = json.loads(file.read_text())["settings"]
+    kept = {"view_sets": settings["view_sets"]}
+    file.write_text(json.dumps({"writer": "deltas depth", "settings": kept, "frames": frames}))
+    assert page_of(capture, folder).shown == 4
+    assert data_of(folder)["verdict"]["line"] == "nothing to judge by"
