@@ -163,25 +163,26 @@ def test_every_array_is_compared(expected: Arrays, found: Arrays) -> None:
         assert found[name].shape == expected[name].shape, name
 
 
-@pytest.mark.parametrize("name", RELATIVE)
-def test_relative(name: str, expected: Arrays, found: Arrays) -> None:
-    difference = largest(found[name] - expected[name])
-    assert difference <= RELATIVE[name] * largest(expected[name])
+# In one test each: workers that take parts of a module each make its arrays, which take long.
+def test_maps_scores_and_lengths(expected: Arrays, found: Arrays) -> None:
+    for name, relative in RELATIVE.items():
+        difference = largest(found[name] - expected[name])
+        assert difference <= relative * largest(expected[name]), name
 
 
-@pytest.mark.parametrize("name", ABSOLUTE)
-def test_pixels(name: str, expected: Arrays, found: Arrays) -> None:
-    assert largest(found[name] - expected[name]) <= ABSOLUTE[name]
+def test_pixels(expected: Arrays, found: Arrays) -> None:
+    for name, absolute in ABSOLUTE.items():
+        assert largest(found[name] - expected[name]) <= absolute, name
 
 
-@pytest.mark.parametrize("name", EXACT)
-def test_exact(name: str, expected: Arrays, found: Arrays) -> None:
-    np.testing.assert_array_equal(found[name], expected[name])
+def test_exact(expected: Arrays, found: Arrays) -> None:
+    for name in EXACT:
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
 
 
-@pytest.mark.parametrize("name", SETS)
-def test_sets_of_pixels(name: str, expected: Arrays, found: Arrays) -> None:
-    assert set(map(tuple, found[name])) == set(map(tuple, expected[name]))
+def test_sets_of_pixels(expected: Arrays, found: Arrays) -> None:
+    for name in SETS:
+        assert set(map(tuple, found[name])) == set(map(tuple, expected[name])), name
 
 
 def test_scores_belong_to_their_pixels(expected: Arrays, found: Arrays) -> None:
@@ -199,26 +200,24 @@ def test_angles_modulo_half_a_turn(expected: Arrays, found: Arrays) -> None:
     assert largest(difference - np.pi * np.round(difference / np.pi)) <= 1e-5
 
 
-@pytest.mark.parametrize("name", MAPS)
-def test_maps_up_to_half_a_turn(name: str, expected: Arrays, found: Arrays) -> None:
-    limit = MAPS[name] * (1 if name == "probe_grid" else largest(expected[name]))
-    for view, point in np.ndindex(found[name].shape[1:3]):
-        one, other = found[name][0, view, point], expected[name][0, view, point]
-        assert min(largest(one - other), largest(one[::-1, ::-1] - other)) <= limit
+def test_maps_up_to_half_a_turn(expected: Arrays, found: Arrays) -> None:
+    for name, limit in MAPS.items():
+        most = limit * (1 if name == "probe_grid" else largest(expected[name]))
+        for view, point in np.ndindex(found[name].shape[1:3]):
+            one, other = found[name][0, view, point], expected[name][0, view, point]
+            assert min(largest(one - other), largest(one[::-1, ::-1] - other)) <= most, name
 
 
-@pytest.mark.parametrize("name", POINTS)
-def test_points(name: str, expected: Arrays, found: Arrays) -> None:
-    distance = np.linalg.norm(expected[name], axis=-1)
-    error = np.linalg.norm(found[name] - expected[name], axis=-1) / distance
+def test_points(expected: Arrays, found: Arrays) -> None:
     seen = expected["in_range"].any(axis=1)
     assert seen.sum() == 489
-    assert error[seen].max() <= POINTS[name]
-    assert error.max() <= max(1e-2, POINTS[name])
+    for name, limit in POINTS.items():
+        distance = np.linalg.norm(expected[name], axis=-1)
+        error = np.linalg.norm(found[name] - expected[name], axis=-1) / distance
+        assert error[seen].max() <= limit, name
+        assert error.max() <= max(1e-2, limit), name
 
 
-@pytest.mark.parametrize("name", ["sparse_depth", "sharp_sparse_depth"])
-def test_sparse_depth_is_empty_in_the_same_places(
-    name: str, expected: Arrays, found: Arrays
-) -> None:
-    np.testing.assert_array_equal(found[name] == 0, expected[name] == 0)
+def test_sparse_depth_is_empty_in_the_same_places(expected: Arrays, found: Arrays) -> None:
+    for name in ("sparse_depth", "sharp_sparse_depth"):
+        np.testing.assert_array_equal(found[name] == 0, expected[name] == 0, err_msg=name)

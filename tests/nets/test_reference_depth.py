@@ -210,6 +210,7 @@ def test_one_camera_for_all_frames_or_an_error(capture: Capture) -> None:
     predicting.check_cameras([*frames, zoomed], work_size=(24, 32))
 
 
+@pytest.mark.slow  # test_reference.py runs the network with these weights
 @pytest.mark.shared
 def test_formula_weights_at_the_size_of_the_original(
     run: Run, make_capture: MakeCapture, shared_data: Path, tmp_path: Path
