@@ -15,11 +15,28 @@ from deltas_nets.commands.depth import Depth
 from deltas_nets.commands.distill import Distill
 from deltas_nets.commands.evaluate import Evaluate
 from deltas_nets.commands.export import Export
+from deltas_nets.commands.fuse import Fuse
 from deltas_nets.commands.page import Page
 from deltas_nets.commands.recipe import Recipe
 from deltas_nets.commands.train import Train
+from deltas_nets.commands.view import View
 
-COMMANDS = (Demo, Depth, Page, Check, Convert, Evaluate, Train, Recipe, Distill, Calibrate, Export, Cost)
+COMMANDS = (
+    Demo,
+    Depth,
+    Fuse,
+    Page,
+    View,
+    Check,
+    Convert,
+    Evaluate,
+    Train,
+    Recipe,
+    Distill,
+    Calibrate,
+    Export,
+    Cost,
+)
 
 
 def main() -> None:

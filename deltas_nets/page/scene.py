@@ -13,7 +13,17 @@ from deltas_nets.page.maps import Maps
 from deltas_nets.page.pictures import spread
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
 
-__all__ = ["Camera", "Layer", "camera_of", "layers_of", "sparse_layer", "up_of"]
+__all__ = [
+    "Camera",
+    "Layer",
+    "SurePoints",
+    "camera_of",
+    "fused_layers",
+    "layers_of",
+    "points_of_maps",
+    "sparse_layer",
+    "up_of",
+]
 
 MOST_POINTS, MOST_FACES = 200_000, 200_000
 """Of a page: 9 bytes a point and 15 a face, a third more in base64."""
@@ -76,14 +86,27 @@ def layers_of(
     Raises:
         UserError: a file cannot be read.
     """
+    found = fused_layers(maps, most_points=most_points, most_faces=most_faces)
+    if found:
+        return found
+    points = points_of_maps(maps)
+    sure = points.confidence >= SURE
+    surface = Surface(points.surface.xyz[sure], points.surface.rgb[sure])
+    return [Layer("points of the maps", thinned(surface, most_points))] if sure.any() else []
+
+
+def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer]:
+    """The mesh and the cloud that lie in the folder.
+
+    Raises:
+        UserError: a file cannot be read.
+    """
     found = []
     for name, file in (("mesh", "mesh.ply"), ("cloud", "cloud.ply")):
         if (maps.folder / file).exists():
             surface = read_surface(maps.folder / file)
             most = most_points if surface.faces is None else most_faces
             found.append(Layer(name, thinned(surface, most)))
-    if not found:
-        found.append(Layer("points of the maps", thinned(_points_of_maps(maps), most_points)))
     return [layer for layer in found if len(layer.surface.xyz)]
 
 
@@ -95,19 +118,36 @@ def sparse_layer(capture: Capture, most_points: int = MOST_POINTS) -> Layer | No
     return Layer("sparse points of the capture", thinned(surface, most_points))
 
 
-def _points_of_maps(maps: Maps) -> Surface:
+class SurePoints(NamedTuple):
+    """Points, and how sure each is.
+
+    Attributes:
+        surface: N points.
+        confidence: ``(N,)`` in [0, 1]; 1 where the network stated none.
+    """
+
+    surface: Surface
+    confidence: NDArray[np.float32]
+
+
+def points_of_maps(maps: Maps) -> SurePoints:
+    """Some of the points of some of the maps, evenly spread.
+
+    Raises:
+        UserError: a file cannot be read.
+    """
     xyz, rgb = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    confidence = [np.zeros(0, np.float32)]
     for id in spread(maps.ids, MAPS_OF_CLOUD):
         read = maps.points(id)
         if read is None:
             continue
         points, colors = read
         some = slice(None, None, -(-len(points) // POINTS_OF_MAP) or 1)
-        points, colors = points[some], colors[some]
-        sure = _confidence_at(points, maps, id) >= SURE
-        xyz.append(points[sure])
-        rgb.append(colors[sure])
-    return Surface(np.concatenate(xyz), np.concatenate(rgb))
+        xyz.append(points[some])
+        rgb.append(colors[some])
+        confidence.append(_confidence_at(points[some], maps, id))
+    return SurePoints(Surface(np.concatenate(xyz), np.concatenate(rgb)), np.concatenate(confidence))
 
 
 def _confidence_at(points: NDArray[np.float64], maps: Maps, id: str) -> NDArray[np.float32]:

@@ -89,7 +89,8 @@ def thinned(surface: Surface, most: int) -> Surface:
         # A surface's points are as many as the inverse square of what they are apart.
         cell *= 1.05 * (max(count, 1) / most) ** 0.5
     if found is None:  # no cell holds two of them, or all are in one place
-        found = Surface(*(part[:: -(-len(surface.xyz) // most)] for part in surface[:2]))
+        some = slice(None, None, -(-len(surface.xyz) // most))
+        found = Surface(surface.xyz[some], surface.rgb[some])
     return found
 
 
@@ -98,7 +99,7 @@ def _without_far(surface: Surface) -> Surface:
     if not len(surface.xyz):
         return surface
     middle, reach = np.median(surface.xyz, axis=0), FAR * _side(surface.xyz)
-    near = (np.abs(surface.xyz - middle) <= reach).all(axis=1)
+    near = np.abs(surface.xyz - middle).max(axis=1) <= reach
     if near.all():
         return surface
     faces = surface.faces

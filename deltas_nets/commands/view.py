@@ -1,0 +1,62 @@
+"""The command `deltas view`."""
+
+import contextlib
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deltas_nets.commands.command import Command
+from deltas_nets.commands.flags import Flag
+from deltas_nets.errors import UserError
+
+
+@dataclass(frozen=True)
+class View(Command):
+    """Show a capture in three dimensions: cameras, sparse points and, of DEPTHS, what was found.
+
+    A browser shows cameras with their images, the points of the depth maps above a confidence that
+    can be moved, mesh.ply and cloud.ply where they lie beside the maps, and the points that the
+    capture's own program triangulated. It needs the extra "view". Ctrl-C ends it.
+
+    Example: deltas view my_capture my_capture-depth
+    """
+
+    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
+        kw_only=True
+    )
+    """Folder or file of a capture."""
+    depths: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[DEPTHS]")] = field(
+        default=None, kw_only=True
+    )
+    """Folder that deltas depth filled."""
+    port: int = 8080
+    """Where to serve it; the next one that is free if another program has it."""
+    host: str = "127.0.0.1"
+    """Who may look: this machine alone, or 0.0.0.0 for all that reach it."""
+    intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
+    """As they were given to deltas depth, if they were."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from deltas_nets.captures.camera_words import Intrinsics
+        from deltas_nets.captures.opening import open_capture
+        from deltas_nets.page.maps import open_maps
+        from deltas_nets.view.viewer import check_extra, open_viewer
+
+        check_extra()
+        if not 0 < self.port < 65536:
+            raise UserError("no port", f"--port {self.port}", "give 1 to 65535")
+        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
+        capture = open_capture(self.capture, intrinsics=stated)
+        maps = None if self.depths is None else open_maps(capture, self.depths)
+        server = open_viewer(capture, maps, host=self.host, port=self.port)
+        print(f"look at http://{self.host}:{server.get_port()}; Ctrl-C ends it", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.sleep_forever()
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
