@@ -1,0 +1,134 @@
+"""The command `deltas fuse`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from deltas_nets.commands.command import Command
+from deltas_nets.commands.flags import Flag, sensible
+from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress, warn
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+    from deltas_nets.fuse.fusing import Fused
+    from deltas_nets.fuse.products import FusedName
+
+
+@dataclass(frozen=True)
+class Fuse(Command):
+    """Fuse the depth maps of a capture into a cloud and a mesh.
+
+    Each map is compared with those of frames that see the same: depth stays where they agree, as
+    far as the maps' own deviation lets expect. Writes DIR/cloud.ply (points with colours and
+    normals), DIR/mesh.ply (coloured vertices) and DIR/fuse.json, in the capture's world and unit.
+
+    Example: deltas fuse my_capture my_capture-depth
+
+    The depth of a sensor: deltas fuse my_capture sensor --voxel 0.01
+    """
+
+    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
+        kw_only=True
+    )
+    """Folder with images, poses and intrinsics, or a file that names them."""
+    depths: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DEPTHS")] = field(
+        kw_only=True
+    )
+    """Folder that deltas depth wrote, or the word sensor for the capture's own depth."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder to write to, CAPTURE-fused here if not given; the same command continues a run that
+    was stopped."""
+    cloud: Flag = False
+    """Write cloud.ply; that and mesh.ply are written if nothing is asked for."""
+    mesh: Flag = False
+    """Write mesh.ply."""
+    glb: Flag = False
+    """Write mesh.glb, for browsers and Blender (extra mesh)."""
+    voxel: float | None = None
+    """Side of a voxel in the capture's unit; from the deviation of the maps if not given."""
+    min_confidence: float | None = None
+    """Leave out pixels of less confidence, 0 to 1; 0.3 if not given."""
+    consistency: Flag = True
+    """Do not compare maps with each other: all depth counts."""
+    neighbours: int = 8
+    """Maps that each is compared with."""
+    least: int = 1
+    """Of these so many have to agree with a pixel's depth, more than see through it."""
+    memory: Annotated[float, tyro.conf.arg(metavar="GB")] = 4.0
+    """Gigabytes that the mesh's voxels may take."""
+    intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
+    """As deltas depth was told, if it was."""
+    scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
+    """Metres in a unit of the capture, for sensor depth; maps know theirs."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1."""
+    overwrite: Flag = False
+    """Replace what other settings made."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    going_on = "the same command goes on"
+
+    def run(self) -> None:
+        """Run the command."""
+        from deltas_nets.captures.camera_words import Intrinsics
+        from deltas_nets.captures.opening import open_capture
+        from deltas_nets.captures.scaled import scaled
+
+        out = self.out or Path(f"{self.capture.resolve().stem}-fused")
+        if out.resolve() == self.capture.resolve():
+            what = "the output folder is the capture itself"
+            raise UserError(what, out, "name another folder with --out")
+        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
+        capture = open_capture(self.capture, intrinsics=stated)
+        if self.scale is not None:
+            if not self.scale > 0:
+                raise UserError("no scale", f"--scale {self.scale:g}", "give a positive number")
+            capture = scaled(capture, self.scale)
+        self.fuse(capture, out)
+
+    def fuse(self, capture: "Capture", out: Path) -> None:
+        """Fuse maps of a capture that is open."""
+        from deltas_nets.commands.flags import usable_device
+        from deltas_nets.fuse.config import FuseConfig
+        from deltas_nets.fuse.fusing import fuse_capture
+        from deltas_nets.fuse.sources import Predicted, depth_source
+
+        config = sensible(
+            FuseConfig,
+            voxel=self.voxel,
+            neighbours=self.neighbours if self.consistency else 0,
+            least=self.least,
+        )
+        source = depth_source(capture, self.depths, min_confidence=self.min_confidence)
+        if isinstance(source, Predicted) and source.missing:
+            warn(f"{source.missing} maps of the folder are not finished, and left out")
+        if len(source.ids) == 1 and config.neighbours:
+            warn("there is one map, and none to compare it with")
+            config = sensible(FuseConfig, voxel=self.voxel, neighbours=0)
+        with progress("fuse", len(source.ids)) as report:
+            fused = fuse_capture(
+                source,
+                out,
+                config,
+                self.products(),
+                gigabytes=self.memory,
+                device=usable_device(self.device),
+                overwrite=self.overwrite,
+                report=report,
+            )
+        self._tell(fused)
+
+    def products(self) -> "list[FusedName]":
+        """What is asked for."""
+        asked: dict[FusedName, bool] = {"cloud": self.cloud, "mesh": self.mesh, "glb": self.glb}
+        return [name for name, wanted in asked.items() if wanted] or ["cloud", "mesh"]
+
+    def _tell(self, fused: "Fused") -> None:
+        names = " and ".join(str(file) for file in fused.files)
+        counts = ", ".join(f"{count} {what}" for what, count in fused.counts.items())
+        print(f"{names}: {counts or 'kept from an earlier run'}")
+        print(f"{fused.frames} maps, voxels of {fused.voxel:g}")

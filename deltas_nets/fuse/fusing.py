@@ -1,0 +1,203 @@
+"""A capture's depth maps become files of a cloud and a mesh; a run that was stopped goes on."""
+
+import json
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from deltas_nets.errors import UserError
+from deltas_nets.fuse.cloud import Cloud
+from deltas_nets.fuse.config import FuseConfig
+from deltas_nets.fuse.mesh import without_small_parts
+from deltas_nets.fuse.prepared import PreparedViews
+from deltas_nets.fuse.products import FUSED, FusedName
+from deltas_nets.fuse.sizes import Sizes, check_memory, look_at
+from deltas_nets.fuse.sources import DepthSource
+from deltas_nets.fuse.state import STATE, Sums, read_state, write_state
+from deltas_nets.fuse.surface import surface
+from deltas_nets.fuse.volume import BYTES_OF_BLOCK, Volume
+from deltas_nets.outputs.atomic_files import check_writable, plain, write_json
+from deltas_nets.outputs.summary import difference
+
+__all__ = ["Fused", "fuse_capture"]
+
+SUMMARY = "fuse.json"
+WRITER = "deltas fuse"
+SECONDS_BETWEEN_STATES = 20.0
+SHARE_OF_STATES = 0.1
+"""Of the time that goes into writing states, at most."""
+SMALL_PART = 100.0
+"""Voxel sides squared: parts of a mesh with less area are specks of noise."""
+
+
+class Fused(NamedTuple):
+    """What was made.
+
+    Attributes:
+        frames: that have been added up.
+        voxel: side of a voxel.
+        counts: points, vertices and faces of what was made now; none of what was there.
+        files: what there is.
+    """
+
+    frames: int
+    voxel: float
+    counts: Mapping[str, int]
+    files: Sequence[Path]
+
+
+def fuse_capture(
+    source: DepthSource,
+    out: Path,
+    config: FuseConfig,
+    products: Sequence[FusedName] = ("cloud", "mesh"),
+    *,
+    gigabytes: float = 4.0,
+    device: str = "cpu",
+    overwrite: bool = False,
+    report: Callable[[str], None] = lambda _: None,
+) -> Fused:
+    """Fuse the maps of a source and write the products.
+
+    Args:
+        source: the maps.
+        out: folder to write to.
+        config: how.
+        products: what is wanted.
+        gigabytes: that the volume may take.
+        device: where to compute.
+        overwrite: replace what other settings made.
+        report: called with the id of every frame that is added.
+
+    Raises:
+        UserError: a map is damaged, nothing is left of them, voxels are too fine, or the folder
+            holds what other settings made. What was added up by then is kept, and the same call
+            goes on.
+    """
+    files = {name: out / FUSED[name].file for name in products}
+    for name, file in files.items():
+        FUSED[name].check(file)
+    check_writable(out)
+    settings = json.loads(json.dumps(plain({**asdict(config), **source.settings})))
+    settings["frames"] = list(source.ids)
+    earlier = _check_folder(out, files.values(), settings, overwrite)
+    if earlier and earlier["status"] == "complete" and all(map(Path.exists, files.values())):
+        return Fused(len(source.ids), earlier["voxel"], {}, list(files.values()))
+    source.check()
+    sizes = look_at(source, config.voxel)
+    kinds = {FUSED[name].of for name in products}
+    if "surface" in kinds:
+        check_memory(sizes, gigabytes)
+    sums = _sums(kinds, sizes, device)
+    head = {"writer": WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / SUMMARY, {**head, "status": "running", "settings": settings})
+    _add_up(source, out, config, sums, settings, gigabytes, report)
+    counts = _write(sums, sizes, files)
+    ended = {"status": "complete", "frames": len(source.ids), **counts}
+    write_json(out / SUMMARY, {**head, **ended, "settings": settings})
+    (out / STATE).unlink(missing_ok=True)
+    return Fused(len(source.ids), sizes.voxel, counts, list(files.values()))
+
+
+def _check_folder(
+    out: Path, files: Iterable[Path], settings: Mapping[str, Any], overwrite: bool
+) -> dict[str, Any] | None:
+    """What an earlier run of the same settings left; refuse what others made."""
+    earlier = _read_summary(out / SUMMARY)
+    if earlier is not None and earlier["settings"] == settings:
+        return earlier
+    if overwrite:
+        return None
+    if earlier is not None:
+        what = f"an earlier run had other settings ({difference(earlier, settings)})"
+        raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
+    for file in files:
+        if file.exists():
+            what = "the file exists"
+            raise UserError(what, file, "name another folder, or add --overwrite")
+    return None
+
+
+def _read_summary(path: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    ours = isinstance(content, dict) and content.get("writer") == WRITER
+    return content if ours and "settings" in content and "status" in content else None
+
+
+def _sums(kinds: Collection[str], sizes: Sizes, device: str) -> dict[str, Sums]:
+    sums: dict[str, Sums] = {}
+    if "points" in kinds:
+        sums["points"] = Cloud(sizes.voxel, origin=sizes.origin, device=device)
+    if "surface" in kinds:
+        voxel, truncation = sizes.voxel, sizes.truncation
+        sums["surface"] = Volume(voxel, truncation, origin=sizes.origin, device=device)
+    return sums
+
+
+def _add_up(
+    source: DepthSource,
+    out: Path,
+    config: FuseConfig,
+    sums: Mapping[str, Sums],
+    settings: Mapping[str, Any],
+    gigabytes: float,
+    report: Callable[[str], None],
+) -> None:
+    """Add all views that no earlier run has added."""
+    made_of = {"settings": settings, "sums": sorted(sums)}
+    done = read_state(out, sums, made_of)
+    for id in done:
+        report(id)
+    kept = len(done)
+    saved, saving = time.monotonic(), 0.0
+    try:
+        left = [id for id in source.ids if id not in set(done)]
+        for id, view in PreparedViews(source, config).ahead(left):
+            for added in sums.values():
+                added.add(view)
+            done.append(id)
+            report(id)
+            _check_size(sums.get("surface"), gigabytes)
+            now = time.monotonic()
+            if now - saved > max(SECONDS_BETWEEN_STATES, saving / SHARE_OF_STATES):
+                write_state(out, sums, done, made_of)
+                saved, saving, kept = time.monotonic(), time.monotonic() - now, len(done)
+    finally:
+        if kept < len(done) < len(source.ids):
+            write_state(out, sums, done, made_of)
+
+
+def _check_size(volume: Sums | None, gigabytes: float) -> None:
+    if isinstance(volume, Volume) and len(volume.blocks) * BYTES_OF_BLOCK > gigabytes * 1e9:
+        what = f"the volume has grown beyond {gigabytes:g} GB"
+        raise UserError(what, "--voxel", "use larger voxels, or allow more with --memory")
+
+
+def _write(
+    sums: Mapping[str, Sums], sizes: Sizes, files: Mapping[FusedName, Path]
+) -> dict[str, int]:
+    """Write the products; nothing where there is nothing to write."""
+    counts: dict[str, int] = {}
+    made: dict[str, Any] = {}
+    for kind, added in sums.items():
+        if isinstance(added, Cloud):
+            made[kind] = added.points()
+            counts["points"] = len(made[kind].points)
+        elif isinstance(added, Volume):
+            made[kind] = without_small_parts(surface(added), SMALL_PART * sizes.voxel**2)
+            counts["vertices"], counts["faces"] = len(made[kind].vertices), len(made[kind].faces)
+    if not all(counts.values()):
+        raise UserError(
+            "no depth is left: maps do not overlap, or do not agree",
+            "--no-consistency",
+            "add it to use all depth, or lower --min-confidence",
+        )
+    for name, file in files.items():
+        FUSED[name].write(file, made[FUSED[name].of])
+    return counts

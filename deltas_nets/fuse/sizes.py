@@ -1,0 +1,128 @@
+"""How large voxels should be, and what that takes, by a look at some maps."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.errors import UserError
+from deltas_nets.fuse.blocks import SIDE
+from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.fuse.lattice import REACH, distinct_names
+from deltas_nets.fuse.sources import DepthSource
+from deltas_nets.fuse.volume import BYTES_OF_BLOCK
+
+__all__ = ["Sizes", "check_memory", "look_at"]
+
+LOOKED_AT = 16
+"""Maps that tell the sizes of all."""
+STD_PER_VOXEL = 3.0
+"""A voxel is so much smaller than the deviation of depth: finer ones would show noise."""
+VOXELS_AROUND = 4.0
+"""Least truncation, in voxels."""
+CELL = 0.02
+"""Of the depth: side of the cells by which surfaces are measured."""
+
+
+class Sizes(NamedTuple):
+    """What follows from the maps.
+
+    Attributes:
+        voxel: side of a voxel.
+        truncation: how far behind a surface it is averaged.
+        area: of the surfaces, about.
+        extent: from the origin to the farthest point.
+        origin: ``(3,)`` float64, in the middle of the cameras.
+    """
+
+    voxel: float
+    truncation: float
+    area: float
+    extent: float
+    origin: Tensor
+
+    @property
+    def bytes(self) -> float:
+        """Of the volume, about."""
+        block = SIDE * self.voxel
+        return self.area / block**2 * (2 * self.truncation / block + 1.5) * BYTES_OF_BLOCK
+
+
+def middle_of(capture: Capture) -> Tensor:
+    """``(3,)`` float64, the mean of the cameras' centres."""
+    poses = capture.frames.cam_from_world
+    centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    return torch.from_numpy(centres.mean(axis=0))
+
+
+def look_at(source: DepthSource, voxel: float | None) -> Sizes:
+    """Sizes for the maps of a source.
+
+    Args:
+        source: the maps; every so many are read.
+        voxel: if it is given.
+
+    Raises:
+        UserError: a map cannot be read, or none has depth.
+    """
+    origin = middle_of(source.capture)
+    ids = source.ids[:: 1 + (len(source.ids) - 1) // LOOKED_AT]
+    stds, depths, per_pixel, points = [], [], [], []
+    for id in ids:
+        view = source.view(id)
+        known = view.depth > 0
+        if known.any():
+            depths.append(float(view.depth[known].median()))
+            stds.append(float(view.std[known].median()))
+            per_pixel.append(depths[-1] / float(view.K[0, 0]))
+            points.append(_some_points(view, origin))
+    if not depths:
+        what = "no pixel of the maps has depth that is sure enough"
+        raise UserError(what, source.capture.path, "lower --min-confidence")
+    std = float(np.median(stds))
+    if voxel is None:
+        voxel = float(f"{max(std / STD_PER_VOXEL, float(np.median(per_pixel))):.2g}")
+    return _measured(
+        voxel, std, float(np.median(depths)), points, origin, len(source.ids) / len(ids)
+    )
+
+
+def _some_points(view: DepthView, origin: Tensor) -> Tensor:
+    """``(N, 3)`` from the origin."""
+    points = view.points()[::4, ::4]
+    points = points[points[..., 2] > 0].double()
+    world_from_cam = view.world_from_cam
+    return points @ world_from_cam[:3, :3].T + (world_from_cam[:3, 3] - origin)
+
+
+def _measured(
+    voxel: float, std: float, depth: float, points: Sequence[Tensor], origin: Tensor, more: float
+) -> Sizes:
+    side = CELL * depth
+    places = torch.cat(list(points))
+    cells = len(distinct_names((places / side).floor().long()))
+    # Frames between those that were looked at see some of the same, and something new.
+    area = cells * side**2 * min(more, 2.0)
+    truncation = max(VOXELS_AROUND * voxel, std)
+    return Sizes(voxel, truncation, area, float(places.abs().max()), origin)
+
+
+def check_memory(sizes: Sizes, gigabytes: float) -> None:
+    """Whether a volume of these sizes is small enough.
+
+    Raises:
+        UserError: it is not; the text says with what voxels it would be.
+    """
+    fits = sizes
+    while fits.bytes > gigabytes * 1e9 or fits.extent / fits.voxel > REACH / 2:
+        larger = 1.1 * fits.voxel
+        fits = fits._replace(voxel=larger, truncation=max(VOXELS_AROUND * larger, fits.truncation))
+    if fits is not sizes:
+        raise UserError(
+            f"voxels of {sizes.voxel:g} need about {max(sizes.bytes / 1e9, 0.1):.2g} GB of memory",
+            "--voxel",
+            f"use {fits.voxel:.1g} or more, or allow more with --memory",
+        )

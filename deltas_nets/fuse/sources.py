@@ -1,0 +1,261 @@
+"""Where the depth of a capture's frames comes from: maps that were predicted, or a sensor."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from deltas_geom import Lens
+from deltas_geom.cameras.pixels import pixel_grid, resize_intrinsics
+from deltas_geom.cameras.poses import invert_pose
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.images import header_of_whole_file
+from deltas_nets.captures.scaled import scaled
+from deltas_nets.captures.straight import StraightFrame, photo_pixels, straight
+from deltas_nets.errors import UserError
+from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.fuse.deviation import std_of_confidence, std_of_sensor
+from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map
+from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale
+
+__all__ = ["DepthSource", "Predicted", "Sensed", "depth_source"]
+
+LEAST_CONFIDENCE = 0.3
+"""Of pixels that are used, if nothing else is said."""
+MOST_PREDICTED = 160_000
+"""Pixels of a predicted map that are used, about as many as the network saw."""
+MOST_SENSED = 640 * 480
+
+
+class DepthSource(Protocol):
+    """Depth of some frames of a capture."""
+
+    @property
+    def capture(self) -> Capture:
+        """The frames, in the unit of the depth."""
+
+    @property
+    def ids(self) -> Sequence[str]:
+        """Frames that have depth."""
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """What the depth depends on, for JSON."""
+
+    def check(self) -> None:
+        """Raise what reading would, as far as that is quickly told."""
+
+    def view(self, id: str) -> DepthView:
+        """The depth of a frame.
+
+        Raises:
+            UserError: a file cannot be read.
+        """
+
+
+def depth_source(
+    capture: Capture, depths: Path, *, min_confidence: float | None = None
+) -> DepthSource:
+    """What ``deltas fuse`` calls DEPTHS.
+
+    Args:
+        capture: the frames.
+        depths: a folder of `deltas depth`, or the word sensor.
+        min_confidence: pixels of predicted maps that have less are left out; `LEAST_CONFIDENCE`
+            where confidence is stated if not given.
+
+    Raises:
+        UserError: there is no such depth, or it is of another capture.
+    """
+    if min_confidence is not None and not 0 <= min_confidence <= 1:
+        what = f"no probability: {min_confidence:g}"
+        raise UserError(what, "--min-confidence", "give 0 to 1")
+    if str(depths) == "sensor":
+        return Sensed(capture)
+    return Predicted(capture, depths, min_confidence=min_confidence)
+
+
+class Predicted:
+    """The maps that `deltas depth` wrote of a capture; see `DepthSource`."""
+
+    def __init__(
+        self, capture: Capture, folder: Path, *, min_confidence: float | None = None
+    ) -> None:
+        summary = read_summary(folder / SUMMARY)
+        if summary is None or "view_sets" not in summary["settings"]:
+            what = "the folder holds no depth maps of deltas depth"
+            raise UserError(what, folder, "run deltas depth first, or write sensor instead")
+        made_of = summary["settings"].get("capture", {}).get("cameras")
+        factor = summary.get("scaled_by", 1.0) / capture.scaled_by
+        if factor != 1:
+            capture = scaled(capture, factor, metric=summary.get("unit") == "metre")
+        if made_of != capture.fingerprint():
+            raise UserError(
+                f"the maps were made of other cameras than those of {capture.path}",
+                folder / SUMMARY,
+                "name their capture, with the same --intrinsics, or run deltas depth again",
+            )
+        self.capture = capture
+        self._folder = folder
+        self._scale = recorded_depth_scale(folder)
+        self._has_confidence = "confidence" in summary.get("files", ())
+        if min_confidence and not self._has_confidence:
+            what = "the maps state no confidence"
+            raise UserError(what, "--min-confidence", "leave it out")
+        self._least = round(255 * (LEAST_CONFIDENCE if min_confidence is None else min_confidence))
+        wanted = [str(anchor) for anchor, _ in summary["settings"]["view_sets"]]
+        self.ids = [id for id in wanted if _has_map(folder, id)]
+        self.missing = len(wanted) - len(self.ids)
+        if not self.ids:
+            raise UserError("the folder has no finished map", folder, "run deltas depth again")
+        self.settings = {"depth": summary["settings"], "min_confidence": self._least / 255}
+
+    def check(self) -> None:
+        """Raise what reading would, as far as that is quickly told."""
+        for id in self.ids:
+            for kind in ("depth", "confidence"):
+                file = self._folder / kind / f"{id}.png"
+                if file.exists() and header_of_whole_file(file) is None:
+                    what = f"the {kind} map is no whole PNG"
+                    raise UserError(what, file, "remove it and run deltas depth again")
+
+    def view(self, id: str) -> DepthView:
+        """The map of a frame."""
+        frame = self.capture.frame(id)
+        depth = torch.from_numpy(read_depth_map(self._folder, id, self._scale).copy())
+        depth = torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
+        confidence = None
+        if self._has_confidence:
+            confidence = torch.from_numpy(
+                _read_confidence(self._folder / "confidence" / f"{id}.png")
+            )
+            if confidence.shape != depth.shape:
+                what = f"confidence of {id} is not of the depth map's size"
+                raise UserError(what, self._folder, "run deltas depth again")
+            depth = torch.where(confidence >= self._least, depth, 0.0)
+        return _of_photo(frame, depth, std_of_confidence(depth, confidence), most=MOST_PREDICTED)
+
+
+class Sensed:
+    """What a capture's depth sensor measured; see `DepthSource`."""
+
+    def __init__(self, capture: Capture) -> None:
+        if not capture.metric:
+            what = "sensor depth is in metres, and the capture is not"
+            raise UserError(what, capture.path, "say --scale METRES")
+        self.capture = capture
+        depths = capture.frames.arrays.depths
+        self.ids = [id for id, depth in zip(capture.frames, depths, strict=True) if depth]
+        if not self.ids:
+            what = "the capture has no sensor depth"
+            raise UserError(what, capture.path, "name a folder of deltas depth")
+        self.settings = {"depth": "sensor", "cameras": capture.fingerprint()}
+
+    def check(self) -> None:
+        """Raise what reading would, as far as that is quickly told."""
+        for id in self.ids:
+            self.capture.frame(id).check_depth()
+
+    def view(self, id: str) -> DepthView:
+        """The depth of a frame."""
+        frame = self.capture.frame(id)
+        depth = torch.from_numpy(frame.read_depth().copy())
+        std = std_of_sensor(depth)
+        if frame.depth_K is None and frame.cam_from_depth is None:
+            return _of_photo(frame, depth, std, most=MOST_SENSED)
+        return _of_own_camera(frame, depth, std)
+
+
+def _has_map(folder: Path, id: str) -> bool:
+    return any((folder / "depth" / f"{id}.{name}").exists() for name in DEPTH_FORMATS)
+
+
+def _read_confidence(path: Path) -> NDArray[np.uint8]:
+    try:
+        with Image.open(path) as image:
+            return np.array(image.convert("L"))
+    except (OSError, SyntaxError, ValueError) as error:
+        what = f"the confidence map cannot be read ({error})"
+        raise UserError(what, path, "run deltas depth again") from error
+
+
+def _step(size: tuple[int, int], most: int) -> int:
+    """Every how many pixels of rows and columns, for at most so many in all."""
+    step = 1
+    while (size[0] // step) * (size[1] // step) > most:
+        step += 1
+    return step
+
+
+def _thinned(K: Tensor, step: int) -> Tensor:
+    """K of an image of every step-th pixel, from the middle of the first step on."""
+    thinned = K.clone()
+    thinned[:2] /= step
+    thinned[:2, 2] -= step // 2 / step
+    return thinned
+
+
+def _of_photo(frame: Frame, depth: Tensor, std: Tensor, *, most: int) -> DepthView:
+    """Depth at the photo's pixels, whatever its size; a lens is undone."""
+    size = (depth.shape[0], depth.shape[1])
+    camera = straight(frame)
+    step = _step(size if camera is frame else camera.image_size, most)
+    every = slice(step // 2, None, step)
+    pose = torch.tensor(frame.cam_from_world)
+    if not isinstance(camera, StraightFrame):
+        colors = torch.from_numpy(frame.read_resized(size).copy())
+        K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
+        depth, std, colors = (image[every, every].contiguous() for image in (depth, std, colors))
+        return DepthView(depth, std, colors, _thinned(K, step), pose)
+    grid = pixel_grid(camera.image_size, dtype=torch.float64).view(*camera.image_size, 2)
+    grid = grid[every, every]
+    seen = photo_pixels(camera, grid.reshape(-1, 2), camera.image_size, size).view_as(grid)
+    depth, std = _nearest(depth, seen), _nearest(std, seen)
+    colors = torch.from_numpy(camera.read_image().copy())[every, every].contiguous()
+    K = _thinned(torch.tensor(camera.K), step)
+    return DepthView(depth, torch.where(depth > 0, std, 1.0), colors, K, pose)
+
+
+def _of_own_camera(frame: Frame, depth: Tensor, std: Tensor) -> DepthView:
+    """Depth at the pixels of a camera of its own, with the photo's colours where that sees it."""
+    size = (depth.shape[0], depth.shape[1])
+    photo_K = torch.tensor(frame.K)
+    if frame.depth_K is None:
+        K = resize_intrinsics(photo_K, old_size=frame.image_size, new_size=size)
+    else:
+        K = torch.tensor(frame.depth_K)
+    cam_from_depth = torch.eye(4, dtype=torch.float64)
+    if frame.cam_from_depth is not None:
+        cam_from_depth = torch.tensor(frame.cam_from_depth)
+    step = _step(size, MOST_SENSED)
+    every = slice(step // 2, None, step)
+    pose = invert_pose(cam_from_depth) @ torch.tensor(frame.cam_from_world)
+    depth, std = depth[every, every].contiguous(), std[every, every].contiguous()
+    view = DepthView(depth, std, depth.new_zeros(*depth.shape, 3).byte(), _thinned(K, step), pose)
+    points = view.points().double() @ cam_from_depth[:3, :3].T + cam_from_depth[:3, 3]
+    if frame.lens is None:
+        z = points[..., 2:].clamp_min(1e-9)
+        pixels = (points @ photo_K.T)[..., :2] / z
+    else:
+        coefficients = torch.tensor(frame.lens.coefficients, dtype=torch.float64)
+        lens = Lens(photo_K, coefficients, frame.lens.model)
+        pixels = lens.project(points.reshape(-1, 3)).pixels.view(*depth.shape, 2)
+    photo = torch.from_numpy(frame.read_image().copy())
+    return view._replace(colors=_nearest(photo, pixels))
+
+
+def _nearest(image: Tensor, pixels: Tensor) -> Tensor:
+    """An image ``(H, W, ...)`` at pixels ``(h, w, 2)``; 0 beyond it."""
+    height, width = image.shape[:2]
+    column, row = (pixels + 0.5).floor().unbind(dim=-1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row = column.clamp(0, width - 1).long(), row.clamp(0, height - 1).long()
+    found = image[row, column]
+    inside = inside.view(*inside.shape, *(1,) * (image.ndim - 2))
+    return torch.where(inside, found, torch.zeros_like(found))

@@ -1,0 +1,76 @@
+"""What a fusion knows after some frames, in one file, so that a run that was stopped goes on."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.outputs.atomic_files import write_atomically
+
+__all__ = ["STATE", "Sums", "read_state", "write_state"]
+
+STATE = "fuse.state.safetensors"
+
+
+class Sums(Protocol):
+    """What adds views up: a `Cloud`, a `Volume`."""
+
+    def add(self, view: DepthView) -> None:
+        """Add one."""
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """The sums."""
+
+    def restore(self, state: dict[str, torch.Tensor]) -> None:
+        """Take them over."""
+
+
+def write_state(
+    folder: Path, sums: Mapping[str, Sums], done: Sequence[str], settings: object
+) -> None:
+    """Write the sums of the frames that are done, atomically.
+
+    Raises:
+        UserError: the system refuses.
+    """
+    tensors = {
+        f"{name}.{part}": tensor.contiguous().cpu()
+        for name, added in sums.items()
+        for part, tensor in added.state().items()
+    }
+    metadata = {"done": json.dumps(list(done)), "settings": json.dumps(settings)}
+    # By its name: in memory the bytes would be there twice.
+    write_atomically(folder / STATE, lambda file: save_file(tensors, file.name, metadata))
+
+
+def read_state(folder: Path, sums: Mapping[str, Sums], settings: object) -> list[str]:
+    """Restore the sums of an earlier run.
+
+    Returns:
+        The frames that they hold; none where no run of these settings left any.
+    """
+    try:
+        with safe_open(str(folder / STATE), framework="pt") as opened:
+            metadata = opened.metadata() or {}
+            if metadata.get("settings") != json.dumps(settings):
+                return []
+            names = opened.keys()
+            tensors = {name: opened.get_tensor(name) for name in names}
+    except (SafetensorError, OSError):
+        return []
+    for name, added in sums.items():
+        start = f"{name}."
+        added.restore(
+            {
+                key.removeprefix(start): value
+                for key, value in tensors.items()
+                if key.startswith(start)
+            }
+        )
+    done: list[str] = json.loads(metadata["done"])
+    return done
