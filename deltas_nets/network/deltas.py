@@ -1,7 +1,7 @@
 """DELTAS: the method whole. Start reading here."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,7 @@ from deltas_nets.config import NetworkConfig
 from deltas_nets.network.build import build_stages
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.image_range import check_images
+from deltas_nets.network.known_depth import KnownDepth, reconciled
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.densifier import DenseDepth
@@ -40,6 +41,20 @@ class Evidence(Record):
     confidence: Tensor
     posterior: Posterior
     dense: DenseDepth
+
+
+class Densified(NamedTuple):
+    """What the last stage says.
+
+    Attributes:
+        dense: at all scales.
+        depth: ``(B, 1, H, W)`` metres along z.
+        std: ``(B, 1, H, W)`` its standard deviation, metres, calibrated if the weights are.
+    """
+
+    dense: DenseDepth
+    depth: Tensor
+    std: Tensor
 
 
 class DepthPrediction(Record):
@@ -117,6 +132,7 @@ class Deltas(nn.Module):
         num_keypoints: int | None = None,
         shift: Tensor | None = None,
         refinement: int | None = None,
+        known: KnownDepth | None = None,
     ) -> DepthPrediction:
         """Predict the depth of view 0.
 
@@ -131,6 +147,7 @@ class Deltas(nn.Module):
             refinement: room for this many samples in each bin of inverse depth, whatever the
                 cameras, where shapes must not follow from values. Without it there are as many as
                 the widest view needs.
+            known: ``(*B, 1, H, W)`` depth of view 0 that joins the triangulated points.
 
         Raises:
             ShapeError: a trailing shape differs, there is no source, or the batch is empty.
@@ -158,6 +175,7 @@ class Deltas(nn.Module):
             num_keypoints=num_keypoints,
             shift=None if shift is None else shift.reshape(-1, 2),
             refinement=refinement,
+            known=None if known is None else _flat_maps(known),
         )
         return with_batch_dims(prediction, batch)
 
@@ -184,6 +202,7 @@ class Deltas(nn.Module):
         num_keypoints: int | None = None,
         shift: Tensor | None = None,
         refinement: int | None = None,
+        known: KnownDepth | None = None,
     ) -> DepthPrediction:
         """Predict the depth of view 0 of encoded images.
 
@@ -195,6 +214,7 @@ class Deltas(nn.Module):
             num_keypoints: instead of the config's.
             shift: ``(B, 2)`` as for :meth:`forward`.
             refinement: as for :meth:`forward`.
+            known: ``(B, 1, H, W)`` as for :meth:`forward`.
         """
         features, descriptors = encoded
         views, origin = moved_to_anchor(views, torch.promote_types(self.dtype, torch.float32))
@@ -225,21 +245,39 @@ class Deltas(nn.Module):
                 weights=confidence,
                 reduce="mean",
             )
-        dense = self.densifier(features, sparse)
-
+        dense, depth, std = self.densified(encoded, sparse, num_views=views.K.shape[1])
+        if known is not None:
+            sparse = reconciled(sparse, known, dense.log_depth[0])
+            dense, depth, std = self.densified(encoded, sparse, num_views=views.K.shape[1])
         in_world = torch.where(points.valid[..., None], points.points + origin, 0.0)
-        full = dense.log_depth[0].exp()
-        # A Laplace distribution deviates by sqrt(2) of its scale.
-        log_std = upsample_to(dense.log_spread, image_size) + 0.5 * math.log(2)
         return DepthPrediction(
-            depth=full,
-            std=self.calibration(log_std, views.K.shape[1]).exp() * full,
+            depth=depth,
+            std=std,
             keypoints=keypoints,
             matches=matches,
             points=points._replace(points=in_world),
             sparse=sparse,
             evidence=Evidence(confidence, posterior, dense),
         )
+
+    def densified(self, encoded: Encoded, sparse: SparseDepth, *, num_views: int) -> Densified:
+        """The last stage alone: a map of whatever sparse depth there is.
+
+        Args:
+            encoded: the anchor, or a view set whose first view it is, of B images.
+            sparse: ``(B, 1, H, W)`` its points.
+            num_views: how many views these come from, for the standard deviation.
+        """
+        dense = self.densifier(encoded.features, sparse)
+        depth = dense.log_depth[0].exp()
+        size = (sparse.depth.shape[-2], sparse.depth.shape[-1])
+        # A Laplace distribution deviates by sqrt(2) of its scale.
+        log_std = upsample_to(dense.log_spread, size) + 0.5 * math.log(2)
+        return Densified(dense, depth, self.calibration(log_std, num_views).exp() * depth)
+
+
+def _flat_maps(known: KnownDepth) -> KnownDepth:
+    return KnownDepth(*(part.reshape(-1, *part.shape[-3:]) for part in known))
 
 
 def with_batch_dims(prediction: DepthPrediction, batch: torch.Size) -> DepthPrediction:
