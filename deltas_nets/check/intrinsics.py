@@ -10,6 +10,7 @@ from deltas_nets.captures.frame import FloatArray
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.mending import changing_frames
 from deltas_nets.check.rewrite import of_size, swapped, with_K
+from deltas_nets.check.trying import common
 
 __all__ = ["Suspicion", "in_a_line", "suspicion_of", "wrong_intrinsics"]
 
@@ -101,6 +102,8 @@ def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | 
     factor = 0.5 / (0.5 + (right + down) / 2)
     if abs(right - down) < AGREEING and factor > 0:
         evidence = f"{point} is in the middle of images {1 / factor:.3g} times as large"
+        # A principal point is in the middle within a few parts of a hundred.
+        factor = common(factor, within=0.04)
         other = of_size(K, factor)
         cure = f"scale it: K times {factor:.4g} is {in_a_line(other)}"
         return Suspicion(Fault.K_OF_OTHER_SIZE, evidence, cure, other)

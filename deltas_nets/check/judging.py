@@ -10,6 +10,7 @@ from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.trials import level
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.check.axes import other_axes
 from deltas_nets.check.depth_camera import unregistered_depth
 from deltas_nets.check.evidence import evidence_of
 from deltas_nets.check.finding import Fault, Finding
@@ -118,6 +119,10 @@ def _explained(
         return [
             next(s for s in suspects if s.tried.after <= 1.25 * best.tried.after + 0.05).finding
         ]
+    if level(given) > ENOUGH:
+        otherwise = other_axes(capture, matched, evidence, given)
+        if otherwise is not None:
+            return [otherwise.finding]
     strict = residuals(evidence, *matched.views(capture.frames), share=MOSTLY)
     apart = views_apart(evidence, strict, len(matched.positions))
     if apart:

@@ -25,6 +25,13 @@ __all__ = ["Refused", "refused"]
 _LARGEST = 4096  # bytes of a file with one matrix
 _MOST_FILES = 100_000
 _SIZE = re.compile(r"images of (\d+)x(\d+)")
+_NO_POSES = {
+    re.compile(r"\bpose\b.* mirrors:"): Fault.POSES_MIRROR,
+    re.compile(r"\bpose\b.* scales by"): Fault.POSES_SCALE,
+    re.compile(r"\bpose\b.* is transposed:"): Fault.POSES_TRANSPOSED,
+    re.compile(r"\bpose\b.* (is not rigid:|has the last row)"): Fault.REFUSED,
+}
+"""What readers say of a matrix that is no pose, which is no K either."""
 _OF_OTHER_SIZE = re.compile(r"image is (\d+)x(\d+), its camera is for (\d+)x(\d+)")
 
 
@@ -53,7 +60,11 @@ def refused(path: Path, error: UserError) -> Refused:
     if not path.is_dir() and not path.is_file():
         raise error
     evidence = f"{error.what}, {error.where}"
-    plain = Refused(Finding(Fault.REFUSED, evidence, (), error.remedy, "error"), None)
+    of_pose = next((fault for words, fault in _NO_POSES.items() if words.search(error.what)), None)
+    cause = of_pose or Fault.REFUSED
+    plain = Refused(Finding(cause, evidence, (), error.remedy, "error"), None)
+    if of_pose is not None:
+        return plain
     matrix = _matrix(Path(error.where))
     if matrix is not None:
         return _of_intrinsics(path, error, matrix) or plain

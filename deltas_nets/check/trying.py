@@ -11,7 +11,7 @@ from deltas_geom.diagnosis.evidence import Evidence, residuals
 from deltas_geom.diagnosis.trials import level
 from deltas_nets.check.finding import Finding
 
-__all__ = ["ENOUGH", "Suspect", "Tried", "rounded", "searched", "tried"]
+__all__ = ["ENOUGH", "Suspect", "Tried", "common", "rounded", "searched", "tried"]
 
 ENOUGH = 2.0
 """px at the size that frames are looked at (about 400 wide): cameras that fit are below."""
@@ -78,6 +78,16 @@ def searched(cost: Callable[[float], float], low: float = 0.4, high: float = 2.6
 
 def rounded(factor: float, cost: Callable[[float], float]) -> float:
     """A factor that people resize by, where that is next to the best and about as good."""
+    near = common(factor, within=0.02)
+    return near if cost(near) <= 1.15 * cost(factor) + 0.05 else factor
+
+
+def common(factor: float, *, within: float) -> float:
+    """The nearest factor that people resize by, if it is within a part of this one; else this.
+
+    Example:
+        >>> common(2.05, within=0.04), common(2.5, within=0.04)
+        (2.0, 2.5)
+    """
     near = min(COMMON, key=lambda common: abs(np.log(common / factor)))
-    good = cost(near) <= 1.15 * cost(factor) + 0.05
-    return near if abs(np.log(near / factor)) < 0.02 and good else factor
+    return near if abs(np.log(near / factor)) < within else factor

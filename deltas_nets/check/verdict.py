@@ -39,12 +39,19 @@ class Checked(NamedTuple):
     @property
     def verdict(self) -> str:
         """One line."""
+        looked = f"{self.figures.looked_at} of {self.figures.frames} frames"
         if not self.findings:
-            residual = f": matches fit to {self.figures.residual:.2g} px"
-            return "no finding" + (residual if self.figures.pairs else "")
+            fit = f": matches of {looked} fit to {self.figures.residual:.2g} px"
+            return "no finding" + (fit if self.figures.pairs else "")
         first = self.findings[0]
-        more = f" (and {len(self.findings) - 1} more)" if len(self.findings) > 1 else ""
-        return f"{first.cause.value}{more}"
+        more = f", and {len(self.findings) - 1} more" if len(self.findings) > 1 else ""
+        seen = f" ({looked} looked at)" if self.figures.looked_at else ""
+        return f"{first.cause.value}{more}{seen}"
+
+    @property
+    def mendable(self) -> tuple[Finding, ...]:
+        """Those that can be mended in memory."""
+        return tuple(finding for finding in self.findings if finding.mend is not None)
 
     def mended(self, capture: Capture) -> Capture:
         """The capture with everything mended that can be."""
@@ -98,12 +105,10 @@ def check_capture(
             told.add(Fault.FROZEN_POSES)  # those that filled up a list that was too short
         found = [one for one in found if one.cause not in told]
     if figures.looked_at < len(readable.frames):
-        more = [
-            _all_apart(readable, network, one, threads)
-            if one.cause is Fault.FRAMES_DISAGREE
-            else one
-            for one in more
-        ]
+        for place, one in enumerate(more):
+            if one.cause is Fault.FRAMES_DISAGREE:
+                more[place], looked = _all_apart(readable, network, one, threads)
+                figures = figures._replace(looked_at=max(figures.looked_at, looked))
     told_before = [*certain, *found]
     for guess in [*known, *guesses][-1:]:
         improved, more = improved_guess(guess, more, readable)
@@ -118,13 +123,15 @@ def _checked(findings: list[Finding], figures: Figures, start: float) -> Checked
     return Checked(tuple(ordered), figures._replace(seconds=time.monotonic() - start))
 
 
-def _all_apart(capture: Capture, network: Deltas, found: Finding, threads: int) -> Finding:
-    """The finding with all frames that disagree, of those looked at or not."""
+def _all_apart(
+    capture: Capture, network: Deltas, found: Finding, threads: int
+) -> tuple[Finding, int]:
+    """The finding with all frames that disagree, and how many were looked at."""
     apart, looked = scan_frames(capture, network, threads=threads)
     ids = set(found.frames) | {capture.frames.id_at(position) for position in apart}
     if len(ids) == len(found.frames):
-        return found
+        return found, looked
     named = tuple(id for id in capture.frames if id in ids)
     what = f"{found.evidence}; of {looked} frames looked at closer {len(named)} disagree"
     cure = f"leave out {ids_in_words(named, 40)}, or track them again"
-    return found._replace(evidence=what, frames=named, cure=cure, mend=leaving_out(named))
+    return found._replace(evidence=what, frames=named, cure=cure, mend=leaving_out(named)), looked

@@ -8,7 +8,7 @@ from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.finding import Finding
 from deltas_nets.check.verdict import Checked
 
-__all__ = ["report_lines"]
+__all__ = ["mended_in_words", "report_lines"]
 
 _WIDTH = 96
 
@@ -36,12 +36,26 @@ def cure_in_words(finding: Finding, capture: Path) -> str:
 def figures_in_words(checked: Checked) -> str:
     """What was looked at, in a line."""
     found = checked.figures
-    frames = f"{found.looked_at} of {found.frames} frames matched"
+    if not found.frames:
+        return "no frame was looked at"
+    frames = f"{found.looked_at} of {found.frames} frames looked at"
     if not found.pairs:
         return f"{frames}, {found.seconds:.1f} s"
     return (
         f"{frames}: {found.matches} matches in {found.pairs} pairs, median residual "
         f"{found.residual:.2g} px, {100 * found.fit:.0f} % of the pairs fit, {found.seconds:.1f} s"
+    )
+
+
+def mended_in_words(checked: Checked, out: Path) -> str:
+    """What became of --mend, in a line."""
+    if not checked.findings:
+        return f"nothing to mend: {out} is not written"
+    if not checked.mendable:
+        return f"nothing of it can be mended here: {out} is not written"
+    left = len(checked.findings) - len(checked.mendable)
+    return f"mended: {out}" + (
+        f"; {left} of {len(checked.findings)} findings are left" * (left > 0)
     )
 
 

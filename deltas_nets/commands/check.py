@@ -56,7 +56,7 @@ class Check(Command):
         from deltas_nets.check.matched import GROUPS
         from deltas_nets.check.refused import refused
         from deltas_nets.check.verdict import Checked, check_capture
-        from deltas_nets.check.words import report_lines
+        from deltas_nets.check.words import mended_in_words, report_lines
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.errors import UserError
         from deltas_nets.outputs.atomic_files import check_writable, write_json
@@ -93,9 +93,10 @@ class Check(Command):
             print(line)
         if self.json is not None:
             write_json(self.json, checked.in_json())
-        if self.mend is not None and capture is not None:
-            save_capture(checked.mended(capture), self.mend, placing="link")
-            print(f"mended: {self.mend}")
+        if self.mend is not None:
+            if capture is not None and checked.mendable:
+                save_capture(checked.mended(capture), self.mend, placing="link")
+            print(mended_in_words(checked, self.mend))
         if checked.findings:
             sys.stdout.flush()
             sys.exit(1)

@@ -15,6 +15,8 @@ from deltas_nets.check.rewrite import of_shape, of_size, swapped, with_focal
 
 Plant = Callable[[Capture], Capture]
 FLIP = np.diag([1.0, -1, -1, 1])
+ROS = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # x ahead, z up
+UNITY = np.diag([1.0, -1, 1, 1])
 KINECT = 585 / 525
 
 
@@ -73,6 +75,8 @@ MATCHES: dict[str, tuple[Plant, Fault]] = {
     "inverted": (poses(np.linalg.inv), Fault.POSES_INVERTED),
     "OpenGL": (poses(lambda pose: FLIP @ pose), Fault.OPENGL_AXES),
     "OpenGL, inverted": (poses(lambda pose: np.linalg.inv(FLIP @ pose)), Fault.POSES_INVERTED),
+    "ROS": (poses(lambda pose: ROS @ pose), Fault.OTHER_AXES),
+    "Unity": (poses(lambda pose: UNITY @ pose @ UNITY), Fault.OTHER_AXES),
     "millimetres": (poses(lambda pose: scaled(pose, 1000)), Fault.NOT_METRES),
     "another scale": (poses(lambda pose: scaled(pose, 1.3)), Fault.WRONG_SCALE),
     "K of half the size": (intrinsics(lambda K: of_size(K, 0.5)), Fault.K_OF_OTHER_SIZE),

@@ -70,7 +70,7 @@ SLOW = ("K halved", "x and y swapped")
 def test_a_capture_that_is_well_has_no_finding(run: Run, room: Path, tmp_path: Path) -> None:
     result = run("check", room, "--json", tmp_path / "told.json")
     assert (result.code, result.err) == (0, "")
-    assert "no finding" in result.out and "7 of 7 frames matched" in result.out
+    assert "no finding" in result.out and "7 of 7 frames looked at" in result.out
     told = json.loads((tmp_path / "told.json").read_text())
     assert told["findings"] == [] and told["figures"]["residual"] < 0.5
 
@@ -99,6 +99,32 @@ def test_a_place_that_is_taken_is_told_before_anything_is_matched(
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     told = run("check", copy, "--mend", tmp_path / "mine")
     assert told.code == 2 and "not empty" in told.err and "matching" not in told.out
+
+
+NO_POSES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "mirrored": (lambda pose: pose @ np.diag([1.0, 1, -1, 1]), "poses_mirror"),
+    "scaled": (lambda pose: pose @ np.diag([2.5, 2.5, 2.5, 1]), "poses_scale"),
+    "transposed": (np.transpose, "poses_transposed"),
+    "sheared": (lambda pose: pose @ (np.eye(4) + np.eye(4, k=1) * 0.1), "refused"),
+}
+
+
+@pytest.mark.parametrize("name", NO_POSES)
+def test_matrices_that_are_no_poses_are_told_as_such(
+    name: str, run: Run, copy: Path, tmp_path: Path
+) -> None:
+    change, cause = NO_POSES[name]
+    _poses(change)(copy)
+    result = run("check", copy, "--json", tmp_path / "told.json", "--mend", tmp_path / "mended")
+    (found,) = json.loads((tmp_path / "told.json").read_text())["findings"]
+    assert result.code == 1 and found["cause"] == cause and "pose" in found["evidence"]
+    assert "is not written" in result.out and not (tmp_path / "mended").exists()
+
+
+def test_nothing_is_written_where_nothing_is_found(run: Run, room: Path, tmp_path: Path) -> None:
+    result = run("check", room, "--mend", tmp_path / "mended")
+    assert result.code == 0 and "nothing to mend" in result.out
+    assert not (tmp_path / "mended").exists()
 
 
 def test_a_capture_that_nothing_mends_is_one_finding(run: Run, copy: Path, tmp_path: Path) -> None:

@@ -141,8 +141,7 @@ def depth_camera(
         place = matrix_of(values, "cam_from_depth")
         inverse = world_from_cam_inverse(place, path=values.path)
     except UserError as error:
-        remedy = "write a rigid 4x4 matrix, last row 0 0 0 1"
-        raise UserError(f"{values.where}: {error.what}", values.path, remedy) from error
+        raise UserError(f"{values.where}: {error.what}", values.path, error.remedy) from error
     return camera.K(), camera.size, rigid_inverse(inverse)
 
 

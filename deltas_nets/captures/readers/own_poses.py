@@ -29,8 +29,8 @@ def pose_of(frame: Fields) -> FloatArray | Lost:
         # Twice, so that what was printed with few digits becomes a rotation.
         return inverse if keys[0] == "world_from_cam" else rigid_inverse(inverse)
     except UserError as error:
-        remedy = "write poses as rigid 4x4 matrices, last row 0 0 0 1"
-        return Lost("not rigid", UserError(f"{frame.where}: {error.what}", frame.path, remedy))
+        what = f"{frame.where}: {error.what}"
+        return Lost("not rigid", UserError(what, frame.path, error.remedy))
 
 
 def rigid_inverse(rigid: FloatArray) -> FloatArray:

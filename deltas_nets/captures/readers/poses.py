@@ -8,6 +8,7 @@ import numpy as np
 from deltas_nets.captures.capture import Lost
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.readers.rigid import why_not_rigid
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
@@ -23,9 +24,6 @@ __all__ = [
 OPENGL = np.array([1.0, -1, -1, 1])
 """What the columns of a camera-to-world matrix are multiplied by where the camera's y points up and
 it looks along -z."""
-
-RIGID_TOLERANCE = 2e-3
-"""Largest entry of R^T R - I, as in ScanNet's reader."""
 
 
 def rigid(rotation: FloatArray, translation: FloatArray) -> FloatArray:
@@ -50,21 +48,12 @@ def cam_from_world(matrix: FloatArray, *, id: str, path: Path) -> FloatArray | L
         what = f"the pose of frame {id} is not finite"
         remedy = "repair it or take the frame out of the view sets"
         return Lost("no pose", UserError(what, path, remedy))
-    remedy = "write a rotation and a translation in one unit, without scale"
-    rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    if matrix.shape[0] == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        what = f"the last row of the pose of frame {id} is not 0 0 0 1"
-        return Lost("not rigid", UserError(what, path, remedy))
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if not error <= RIGID_TOLERANCE:
-        what = f"the pose of frame {id} is not rigid: its rotation is off orthogonal by {error:.2g}"
-        return Lost("not rigid", UserError(what, path, remedy))
-    if np.linalg.det(rotation) < 0:
-        what = f"the pose of frame {id} mirrors: its rotation has determinant -1"
-        return Lost("not rigid", UserError(what, path, remedy))
-    left, _, right = np.linalg.svd(rotation)
-    pose = rigid(left @ right, translation)
+    why = why_not_rigid(matrix)
+    if why is not None:
+        what = f"the pose of frame {id} {why.what}"
+        return Lost("not rigid", UserError(what, path, why.remedy))
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    pose = rigid(left @ right, matrix[:3, 3])
     pose.setflags(write=False)
     return pose
 

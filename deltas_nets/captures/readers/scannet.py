@@ -10,6 +10,7 @@ from deltas_nets.captures.capture import Capture, FloatArray, Frame, Lost
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrinsics
+from deltas_nets.captures.readers.rigid import why_not_rigid
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
@@ -18,10 +19,6 @@ __all__ = ["NESTING", "is_scene", "read", "recognises", "world_from_cam_inverse"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
 """Folders that scenes may lie in, inside of the one that is named."""
-
-RIGID_TOLERANCE = 2e-3
-"""Largest entry of R^T R - I. Six digits after the point give 1e-5, 7-Scenes as published
-1.5e-4; a scale of 0.1 %, the least that would matter to metric depth, gives 2e-3."""
 
 _NO_POSE = "repair it or take the frame out of the view sets"
 
@@ -168,17 +165,10 @@ def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatAr
     Raises:
         UserError: the matrix is not a rotation and a translation.
     """
+    why = why_not_rigid(world_from_cam)
+    if why is not None:
+        raise UserError(f"the pose {why.what}", path, why.remedy)
     rotation, centre = world_from_cam[:3, :3], world_from_cam[:3, 3]
-    remedy = "write poses as rigid 4x4 camera-to-world matrices, last row 0 0 0 1"
-    if not np.abs(world_from_cam[3] - (0, 0, 0, 1)).max() <= 1e-6:
-        row = " ".join(f"{value:g}" for value in world_from_cam[3])
-        raise UserError(f"the pose's last row is {row}, not 0 0 0 1", path, remedy)
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if not error <= RIGID_TOLERANCE:
-        what = f"the pose is not rigid: its rotation is off orthogonal by {error:.2g}"
-        raise UserError(what, path, remedy)
-    if np.linalg.det(rotation) < 0:
-        raise UserError("the pose mirrors: its rotation has determinant -1", path, remedy)
     # The nearest rotation, else R^T is not the inverse of R and the rounding of the file stays.
     left, _, right = np.linalg.svd(rotation)
     nearest = left @ right
