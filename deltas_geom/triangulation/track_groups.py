@@ -39,14 +39,24 @@ class Group(NamedTuple):
     real: Tensor
 
 
-def check_tracks(num_points: int, **named: Tensor | None) -> None:
+def check_tracks(
+    proj: Tensor,
+    camera_index: Tensor,
+    point_index: Tensor,
+    weights: Tensor | None,
+    *,
+    num_points: int = 0,
+    **others: Tensor | None,
+) -> None:
     """Raise unless lists of observations, of cameras and of points fit each other.
 
     Where indices lead is not looked at.
     """
+    indices = {"camera_index": camera_index, "point_index": point_index}
+    named = {"proj": proj, **others, **indices, "weights": weights}
     lists = {name: (x, _DIMS[name]) for name, x in named.items() if x is not None}
     check_shapes(**lists)
-    check_index(**{name: x for name, (x, _) in lists.items() if name.endswith("_index")})
+    check_index(**indices)
     # A list has no batch: cameras and points of all scenes may share one list instead.
     for name, (tensor, dims) in lists.items():
         if tensor.dim() != len(dims.split()):

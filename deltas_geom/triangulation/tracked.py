@@ -72,14 +72,7 @@ def triangulate_robust_tracks(
         >>> tracks.used.tolist(), tracks.points.round(decimals=3)
         ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
-    check_tracks(
-        num_points,
-        proj=proj,
-        pixels=pixels,
-        camera_index=camera_index,
-        point_index=point_index,
-        weights=weights,
-    )
+    check_tracks(proj, camera_index, point_index, weights, pixels=pixels, num_points=num_points)
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     groups = grouped(camera_index, point_index, len(proj), num_points)
     found = []
@@ -152,15 +145,7 @@ def refine_tracks(
 
     Source: as of :func:`refine_points`.
     """
-    check_tracks(
-        0,
-        proj=proj,
-        pixels=pixels,
-        points=points,
-        camera_index=camera_index,
-        point_index=point_index,
-        weights=weights,
-    )
+    check_tracks(proj, camera_index, point_index, weights, pixels=pixels, points=points)
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     groups = grouped(camera_index, point_index, len(proj), len(points))
     found = []
@@ -216,13 +201,7 @@ def track_covariance(
     Source: as of :func:`point_covariance`.
     """
     check_tracks(
-        0,
-        proj=proj,
-        points=points,
-        camera_index=camera_index,
-        point_index=point_index,
-        weights=weights,
-        pose_covariance=pose_covariance,
+        proj, camera_index, point_index, weights, points=points, pose_covariance=pose_covariance
     )
     groups = grouped(camera_index, point_index, len(proj), len(points))
     found = []

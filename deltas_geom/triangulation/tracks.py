@@ -135,14 +135,7 @@ def triangulate_tracks(
         >>> Status(tracks.status[1].item()).name
         'TOO_FEW_VIEWS'
     """
-    check_tracks(
-        num_points,
-        proj=proj,
-        pixels=pixels,
-        camera_index=camera_index,
-        point_index=point_index,
-        weights=weights,
-    )
+    check_tracks(proj, camera_index, point_index, weights, pixels=pixels, num_points=num_points)
     weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
     return operation(
         TriangulatedTracks,

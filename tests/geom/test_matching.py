@@ -129,6 +129,23 @@ def test_joint_matches_triangulate_to_the_depth_that_all_views_prefer(
     assert found.valid[anyone].all()
 
 
+@given(scene=posed_scenes(num_views=3), scores=vectors(2, within=3.0, size=4 * 31))
+def test_a_joint_score_is_the_mean_over_the_views_that_see_the_sample(
+    scene: PosedScene, scores: Tensor
+) -> None:
+    samples = sample_inv_depths(scene.views, scene.pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
+    hidden = torch.arange(31) % 3 == 0  # from the second source
+    samples.mask[1, ..., hidden] = False
+    scores, seen = scores.reshape(2, 4, 1, 31), samples.mask
+    mean = torch.where(seen, scores, 0.0).sum(dim=0) / seen.sum(dim=0).clamp(min=1)
+    wild = torch.where(seen, scores, 50.0)
+    found, wanted = (
+        match_joint(scene.views, scene.pixels[0], each, samples, image_size=IMAGE_SIZE)
+        for each in (wild, mean.expand(2, 4, 1, 31))
+    )
+    assert_close(tuple(found), tuple(wanted), rtol=0, atol=1e-9)  # px
+
+
 @given(scene=posed_scenes(num_views=3), place=st.integers(0, 30))
 def test_a_match_of_one_view_is_its_best_sample(scene: PosedScene, place: int) -> None:
     samples = sample_inv_depths(scene.views, scene.pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
