@@ -15,11 +15,11 @@ from deltas_nets.terminal import progress
 class Page(Command):
     """Write a page that shows the depth maps of a capture: index.html beside them.
 
-    `deltas depth` does it at its end; this does it for an existing folder, or again once `deltas
-    fuse` has put mesh.ply or cloud.ply there. The page needs no network and no other file. Beside
+    `deltas depth` does it at its end; this does it for an existing folder, or again with the
+    mesh and the cloud of `deltas fuse`. The page needs no network and no other file. Beside
     it: contact_sheet.jpg, and preview/ID.jpg, each map in colours above a scale.
 
-    Example: deltas page my_capture my_capture-depth
+    Example: deltas page my_capture my_capture-depth --fused my_capture-fused
     """
 
     capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")] = field(
@@ -32,6 +32,8 @@ class Page(Command):
     """Folder that deltas depth filled."""
     depth_range: Annotated[tuple[float, float], tyro.conf.arg(metavar="NEAR FAR")] = (0.5, 10.0)
     """Of sensor depth that counts for errors, metres."""
+    fused: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder of mesh.ply or cloud.ply, as deltas fuse wrote it; DEPTHS if not given."""
     intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
     """As they were given to deltas depth, if they were."""
     debug: Flag = False
@@ -47,7 +49,7 @@ class Page(Command):
 
         sensible(PredictConfig, depth_range=self.depth_range)
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        maps = open_maps(open_capture(self.capture, intrinsics=stated), self.depths)
+        maps = open_maps(open_capture(self.capture, intrinsics=stated), self.depths, self.fused)
         with progress("page", len(maps.ids)) as report:
             page = write_page(maps, depth_range=self.depth_range, report=report)
         print(page.line)

@@ -18,8 +18,8 @@ class View(Command):
     """Show a capture in three dimensions: cameras, sparse points and, of DEPTHS, what was found.
 
     A browser shows cameras with their images, the points of the depth maps above a confidence that
-    can be moved, mesh.ply and cloud.ply where they lie beside the maps, and the points that the
-    capture's own program triangulated. It needs the extra "view". Ctrl-C ends it.
+    can be moved, the mesh and the cloud of `deltas fuse`, and the points that the capture's own
+    program triangulated. It needs the extra "view". Ctrl-C ends it.
 
     Example: deltas view my_capture my_capture-depth
     """
@@ -36,6 +36,8 @@ class View(Command):
     """Where to serve it; the next one that is free if another program has it."""
     host: str = "127.0.0.1"
     """Who may look: this machine alone, or 0.0.0.0 for all that reach it."""
+    fused: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder of mesh.ply or cloud.ply, as deltas fuse wrote it; DEPTHS if not given."""
     intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
     """As they were given to deltas depth, if they were."""
     debug: Flag = False
@@ -53,7 +55,9 @@ class View(Command):
             raise UserError("no port", f"--port {self.port}", "give 1 to 65535")
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         capture = open_capture(self.capture, intrinsics=stated)
-        maps = None if self.depths is None else open_maps(capture, self.depths)
+        if self.fused is not None and self.depths is None:
+            raise UserError("no depth maps", "--fused", "name DEPTHS, too")
+        maps = None if self.depths is None else open_maps(capture, self.depths, self.fused)
         server = open_viewer(capture, maps, host=self.host, port=self.port)
         print(f"look at http://{self.host}:{server.get_port()}; Ctrl-C ends it", flush=True)
         with contextlib.suppress(KeyboardInterrupt):

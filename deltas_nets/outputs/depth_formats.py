@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,7 +123,7 @@ def read_depth_map(folder: Path, id: str, scale: float) -> NDArray[np.float32]:
         if file.exists():
             try:
                 return kind.read(file, scale)
-            except (OSError, ValueError, KeyError) as error:
+            except (OSError, ValueError, KeyError, SyntaxError, BadZipFile, EOFError) as error:
                 what = f"the depth map cannot be read ({error})"
                 raise UserError(what, file, "run deltas depth again") from error
     file = folder / "depth" / f"{id}.png"

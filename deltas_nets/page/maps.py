@@ -25,6 +25,8 @@ from deltas_nets.terminal import warn
 __all__ = ["Maps", "open_maps"]
 
 METRE = "metre"
+FUSED = ("mesh.ply", "cloud.ply")
+"""What `deltas fuse` writes."""
 
 
 class Maps(NamedTuple):
@@ -37,6 +39,7 @@ class Maps(NamedTuple):
         missing: frames that were to have one.
         summary: what the run recorded.
         steps: of a depth PNG in the unit.
+        fused: folder with mesh.ply or cloud.ply; that of the maps if not given.
     """
 
     folder: Path
@@ -45,6 +48,7 @@ class Maps(NamedTuple):
     missing: tuple[str, ...]
     summary: Mapping[str, Any]
     steps: float
+    fused: Path
 
     @property
     def unit(self) -> str:
@@ -101,17 +105,20 @@ class Maps(NamedTuple):
         return points.astype(np.float64), colors
 
 
-def open_maps(capture: Capture, folder: Path) -> Maps:
+def open_maps(capture: Capture, folder: Path, fused: Path | None = None) -> Maps:
     """The maps of a capture; those that are missing are named in a warning.
 
     Args:
         capture: as it was opened for `deltas depth`, whatever scale it had there.
         folder: that `deltas depth` filled.
+        fused: that `deltas fuse` filled, if that is another.
 
     Raises:
         UserError: the folder is none of `deltas depth`, its maps are of another capture, or there
-            is not a single one.
+            is not a single one; or nothing fused is where it is said to be.
     """
+    if fused is not None and not any((fused / name).exists() for name in FUSED):
+        raise UserError(f"there is no {' or '.join(FUSED)}", fused, "run deltas fuse first")
     anchors = [views.anchor for views in recorded_view_sets(folder)]
     summary = read_summary(folder / SUMMARY) or {}
     capture = _as_recorded(capture, folder, summary)
@@ -126,7 +133,8 @@ def open_maps(capture: Capture, folder: Path) -> Maps:
         raise UserError("there is no depth map", folder / "depth", "run deltas depth first")
     if missing:
         warn(f"{len(missing)} of {len(known)} maps are missing: {ids_in_words(missing)}")
-    return Maps(folder, capture, ids, missing, summary, recorded_depth_scale(folder))
+    steps = recorded_depth_scale(folder)
+    return Maps(folder, capture, ids, missing, summary, steps, fused or folder)
 
 
 def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> Capture:

@@ -64,7 +64,7 @@ function pyramid({ pose, slopes: [left, top, right, bottom] }, size) {
 }
 
 function sceneIn(canvas, { up, layers, cameras }, onCamera) {
-  const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+  const gl = canvas.getContext("webgl2", { antialias: true });
   const nothing = () => {};
   if (!gl) {
     canvas.replaceWith("This browser shows no WebGL, which the scene needs.");
@@ -90,7 +90,7 @@ function sceneIn(canvas, { up, layers, cameras }, onCamera) {
     gl.bufferData(target, content, gl.STATIC_DRAW);
   }
 
-  const drawn = layers.map((layer) => {
+  const drawn = layers.map((layer, place) => {
     const array = gl.createVertexArray();
     gl.bindVertexArray(array);
     [[layer.xyz, gl.UNSIGNED_SHORT], [layer.rgb, gl.UNSIGNED_BYTE]].forEach(([text, type], slot) => {
@@ -100,7 +100,7 @@ function sceneIn(canvas, { up, layers, cameras }, onCamera) {
     });
     if (layer.faces) buffer(gl.ELEMENT_ARRAY_BUFFER, bytes(layer.faces));
     const extent = Math.hypot(...add(layer.box[1], layer.box[0], -1));
-    return { ...layer, array, shown: true, spacing: 1.5 * extent / Math.sqrt(layer.count) };
+    return { ...layer, array, shown: place === 0, spacing: 1.5 * extent / Math.sqrt(layer.count) };
   });
 
   // How large things are: what is there, and how far cameras are apart
@@ -130,7 +130,7 @@ function sceneIn(canvas, { up, layers, cameras }, onCamera) {
 
   function reset() {
     const target = low.map((x, axis) => (x + high[axis]) / 2);
-    Object.assign(view, { yaw: 0.35, pitch: 0.5, distance: 1.8 * radius, target, slope: 0.5 });
+    Object.assign(view, { yaw: 0.35, pitch: 0.5, distance: 1.6 * radius, target, slope: 0.5 });
     changed();
   }
 
@@ -281,7 +281,7 @@ function sceneIn(canvas, { up, layers, cameras }, onCamera) {
   new ResizeObserver(changed).observe(canvas);
   reset();
   return {
-    layers: [...drawn.map(({ name }) => [name, true]), ["cameras", true]],
+    layers: [...drawn.map(({ name, shown }) => [name, shown]), ["cameras", true]],
     toggle(name, shown) {
       if (name === "cameras") camerasShown = shown;
       else drawn.find((layer) => layer.name === name).shown = shown;

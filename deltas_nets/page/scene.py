@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
-from deltas_nets.page.maps import Maps
+from deltas_nets.page.maps import FUSED, Maps
 from deltas_nets.page.pictures import spread
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
 
@@ -81,7 +81,7 @@ def up_of(capture: Capture) -> FloatArray:
 def layers_of(
     maps: Maps, *, most_points: int = MOST_POINTS, most_faces: int = MOST_FACES
 ) -> list[Layer]:
-    """The mesh and the cloud that lie in the folder, else the points of the maps together.
+    """The mesh and the cloud of `deltas fuse`, else the points of the maps together.
 
     Raises:
         UserError: a file cannot be read.
@@ -96,17 +96,17 @@ def layers_of(
 
 
 def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer]:
-    """The mesh and the cloud that lie in the folder.
+    """The mesh and the cloud of `deltas fuse`, those that are there.
 
     Raises:
         UserError: a file cannot be read.
     """
     found = []
-    for name, file in (("mesh", "mesh.ply"), ("cloud", "cloud.ply")):
-        if (maps.folder / file).exists():
-            surface = read_surface(maps.folder / file)
+    for file in (maps.fused / name for name in FUSED):
+        if file.exists():
+            surface = read_surface(file)
             most = most_points if surface.faces is None else most_faces
-            found.append(Layer(name, thinned(surface, most)))
+            found.append(Layer(file.stem, thinned(surface, most)))
     return [layer for layer in found if len(layer.surface.xyz)]
 
 

@@ -74,11 +74,12 @@ def open_viewer(
     centres = np.array([camera.world_from_cam[:3, 3] for camera in cameras])
     # Browsers compute in float32: what is shown is around the middle of the cameras.
     origin = np.median(centres, axis=0)
-    layers = [layer for layer in (sparse_layer(capture, MOST_POINTS),) if layer is not None]
-    points = None
+    layers, points = [], None
     if maps is not None:
-        layers += fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
+        layers = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
         points = _fewer(points_of_maps(maps))
+    sparse = sparse_layer(capture, MOST_POINTS)
+    layers += [] if sparse is None else [sparse]
 
     from viser import ViserServer
 
@@ -88,11 +89,10 @@ def open_viewer(
     reach = max(float(np.linalg.norm(box[1] - box[0])), SMALLEST)
     _look(server, up_of(capture), cameras, box, reach)
     server.gui.add_markdown(_words(capture, maps))
-    for layer in layers:
-        _show(server, layer, origin, reach)
+    for place, layer in enumerate(layers):
+        _show(server, layer, origin, reach, shown=place == 0)
     if points is not None and len(points.confidence):
-        fused = any(layer.name in ("mesh", "cloud") for layer in layers)
-        _show_points_of_maps(server, points, origin, reach, shown=not fused)
+        _show_points_of_maps(server, points, origin, reach, shown=not layers)
     _show_cameras(server, capture, cameras, origin, reach)
     return server
 
@@ -144,7 +144,9 @@ def _switch(server: "ViserServer", name: str, handles: list[Any], *, shown: bool
             handle.visible = box.value
 
 
-def _show(server: "ViserServer", layer: Layer, origin: FloatArray, reach: float) -> None:
+def _show(
+    server: "ViserServer", layer: Layer, origin: FloatArray, reach: float, *, shown: bool
+) -> None:
     name, (xyz, rgb, faces) = f"/{layer.name}", layer.surface
     if faces is None:
         handle: Any = server.scene.add_point_cloud(
@@ -154,13 +156,14 @@ def _show(server: "ViserServer", layer: Layer, origin: FloatArray, reach: float)
             point_size=0.002 * reach,
             point_shape="circle",
             precision="float32",
+            visible=shown,
         )
     else:
         import trimesh
 
         mesh = trimesh.Trimesh(xyz - origin, faces, vertex_colors=rgb, process=False)
-        handle = server.scene.add_mesh_trimesh(name, mesh)
-    _switch(server, layer.name, [handle])
+        handle = server.scene.add_mesh_trimesh(name, mesh, visible=shown)
+    _switch(server, layer.name, [handle], shown=shown)
 
 
 def _show_points_of_maps(

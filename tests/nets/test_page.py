@@ -239,8 +239,9 @@ def test_points_of_the_maps_are_shown_where_they_are(filled: tuple[Path, Path]) 
     # The slanted plane z = 2 to 3 before the cameras at x = 0 to 0.45.
     assert 2.0 <= layer.surface.xyz[:, 2].min() < layer.surface.xyz[:, 2].max() <= 3.0
     assert layer.surface.xyz[:, 0].max() == pytest.approx(0.45 + 1.5, abs=0.05)
-    mesh_of(folder)
-    (mesh,) = layers_of(open_maps(open_capture(capture), folder))
+    fused = folder.parent / "fused"
+    mesh_of(fused)
+    (mesh,) = layers_of(open_maps(open_capture(capture), folder, fused))
     assert mesh.name == "mesh" and mesh.surface.faces is not None
 
 
@@ -330,8 +331,19 @@ def test_folders_that_are_none_of_ours(
     assert_one_line(run("page", capture, tmp_path / "nowhere"), "summary.json", "run it first")
     other = make_capture(path=tmp_path / "other", step=0.2)
     assert_one_line(run("page", other, folder), "other cameras", "the capture that they were made")
+    assert_one_line(run("page", capture, folder, "--fused", tmp_path), "no mesh.ply", "deltas fuse")
     shutil.rmtree(folder / "depth")
     assert_one_line(run("page", capture, folder), "no depth map", "deltas depth first")
+
+
+def test_a_damaged_archive_is_named(make_capture: MakeCapture, tmp_path: Path, run: Run) -> None:
+    capture = make_capture()
+    write_maps(capture, tmp_path / "maps", options=OutputOptions(depth_format="npz"))
+    assert run("page", capture, tmp_path / "maps").code == 0
+    file = tmp_path / "maps" / "depth" / "3.npz"
+    for content in (file.read_bytes()[:-30], b"PK", b""):
+        file.write_bytes(content)
+        assert_one_line(run("page", capture, tmp_path / "maps"), "depth/3.npz")
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,18 @@ def test_it_opens_without_a_network_and_without_complaints(page: Any) -> None:
     assert page.title == f"{MARKUP}: depth maps"
 
 
+def test_a_page_of_one_frame_without_depth_opens(browser: Any, tmp_path: Path) -> None:
+    out = write_maps(write_capture(tmp_path / "one", 1), tmp_path / "maps", depth=np.zeros)
+    write_page(open_maps(open_capture(tmp_path / "one"), out))
+    browser.get_log("browser")
+    browser.get((out / "index.html").as_uri())
+    settled(browser)
+    assert browser.get_log("browser") == []
+    assert not browser.find_element("id", "next").is_enabled()
+    assert picture_of(browser, "#canvas").std() > 1  # its camera
+    browser.find_element("id", "from").click()
+
+
 def test_the_slider_uncovers_depth(page: Any) -> None:
     set_split(page, 100)
     image = picture_of(page, "#under")
