@@ -16,7 +16,7 @@ class FuseConfig:
     """Maps that each is compared with; 0 for none: all depth counts."""
     least: int = 1
     """Of these so many have to agree with a pixel's depth, and fewer than that see through it."""
-    deviations: float = 1.0
+    deviations: float = 0.5
     """How far depths may differ and agree, in standard deviations of the difference."""
 
     def __post_init__(self) -> None:

@@ -17,6 +17,7 @@ from deltas_nets.fuse.sizes import Sizes, check_memory, look_at
 from deltas_nets.fuse.sources import DepthSource
 from deltas_nets.fuse.state import STATE, Sums, read_state, write_state
 from deltas_nets.fuse.surface import surface
+from deltas_nets.fuse.threads import own_threads
 from deltas_nets.fuse.volume import BYTES_OF_BLOCK, Volume
 from deltas_nets.outputs.atomic_files import check_writable, plain, write_json
 from deltas_nets.outputs.summary import difference
@@ -86,16 +87,17 @@ def fuse_capture(
     if earlier and earlier["status"] == "complete" and all(map(Path.exists, files.values())):
         return Fused(len(source.ids), earlier["voxel"], {}, list(files.values()))
     source.check()
-    sizes = look_at(source, config.voxel)
-    kinds = {FUSED[name].of for name in products}
-    if "surface" in kinds:
-        check_memory(sizes, gigabytes)
-    sums = _sums(kinds, sizes, device)
-    head = {"writer": WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SUMMARY, {**head, "status": "running", "settings": settings})
-    _add_up(source, out, config, sums, settings, gigabytes, report)
-    counts = _write(sums, sizes, files)
+    with own_threads() as threads:
+        sizes = look_at(source, config.voxel)
+        kinds = {FUSED[name].of for name in products}
+        if "surface" in kinds:
+            check_memory(sizes, gigabytes)
+        sums = _sums(kinds, sizes, device, threads)
+        head = {"writer": WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / SUMMARY, {**head, "status": "running", "settings": settings})
+        _add_up(source, out, config, sums, settings, gigabytes, report)
+        counts = _write(sums, sizes, files)
     ended = {"status": "complete", "frames": len(source.ids), **counts}
     write_json(out / SUMMARY, {**head, **ended, "settings": settings})
     (out / STATE).unlink(missing_ok=True)
@@ -130,13 +132,14 @@ def _read_summary(path: Path) -> dict[str, Any] | None:
     return content if ours and "settings" in content and "status" in content else None
 
 
-def _sums(kinds: Collection[str], sizes: Sizes, device: str) -> dict[str, Sums]:
+def _sums(kinds: Collection[str], sizes: Sizes, device: str, threads: int) -> dict[str, Sums]:
     sums: dict[str, Sums] = {}
     if "points" in kinds:
         sums["points"] = Cloud(sizes.voxel, origin=sizes.origin, device=device)
     if "surface" in kinds:
-        voxel, truncation = sizes.voxel, sizes.truncation
-        sums["surface"] = Volume(voxel, truncation, origin=sizes.origin, device=device)
+        sums["surface"] = Volume(
+            sizes.voxel, sizes.truncation, origin=sizes.origin, device=device, threads=threads
+        )
     return sums
 
 

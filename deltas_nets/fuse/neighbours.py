@@ -33,7 +33,7 @@ def neighbours(
         At most ``count`` positions, best first; none where nothing overlaps.
     """
     points, depth = _probes(view)
-    if len(points) == 0 or len(candidates) == 0:
+    if depth == 0 or len(candidates) == 0:
         return []
     poses = frames.cam_from_world[candidates]
     centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]

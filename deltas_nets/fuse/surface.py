@@ -104,7 +104,7 @@ def _marched(field: _Field) -> tuple[NDArray[np.float32], NDArray[np.int32]] | N
     inner = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
     mask[1:, 1:, 1:] = crossed[inner]  # scikit-image looks at the last corner
     vertices, faces, _, _ = marching_cubes(
-        distance.cpu().numpy(), 0.0, mask=mask.cpu().numpy(), gradient_direction="ascent"
+        distance.cpu().numpy(), 0.0, mask=mask.cpu().numpy(), gradient_direction="descent"
     )
     return vertices + low.cpu().numpy().astype(np.float32), faces
 

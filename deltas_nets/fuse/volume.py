@@ -7,6 +7,7 @@ Hashing", SIGGRAPH Asia 2013.
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import torch
@@ -24,7 +25,8 @@ __all__ = ["BYTES_OF_BLOCK", "Volume"]
 CHANNELS = 5  # weight, weighted distance in truncations, weighted red, green, blue
 BYTES_OF_BLOCK = 4 * CHANNELS * VOXELS
 BATCH = 63
-"""Blocks that are projected at once: what is computed of them stays in the cache."""
+"""Blocks that are projected at once. What is computed of them stays in the cache, and no operation
+is long enough for torch to start threads for it, which spin beside a busy neighbour."""
 NEAREST = 1e-6  # of depth; what is nearer to a camera, or behind it, it does not see
 AROUND = 1.75
 """Voxels around a seen point whose blocks are there too, so that cubes at the surface are whole."""
@@ -42,6 +44,7 @@ class Volume:
         origin: ``(3,)`` float64 world point that voxels count from; near the scene, so that float32
             is fine enough.
         device: where sums are kept and computed.
+        threads: of Python, that share the blocks of a view.
 
     Example:
         >>> flat = torch.full((48, 64), 1.0)
@@ -60,8 +63,9 @@ class Volume:
         *,
         origin: Tensor | None = None,
         device: str | torch.device = "cpu",
+        threads: int = 1,
     ) -> None:
-        self.voxel = voxel
+        self.voxel, self._threads = voxel, threads
         self.truncation = 4 * voxel if truncation is None else truncation
         self.origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin.double()
         self.blocks = Blocks(CHANNELS, device)
@@ -83,9 +87,17 @@ class Volume:
         offsets = (proj[:, :3] @ (self._inside * self.voxel).T).float().to(device)
         corners = positions * (SIDE * self.voxel)
         corners = (proj[:, :3] @ corners.T + proj[:, 3:]).float().to(device)
-        for part in _batches(slots):
+
+        def add(part: slice) -> None:
             slab = self.blocks.slab(int(slots[part.start]) // SLAB)
             seen.add_to(slab, slots[part] % SLAB, corners[:, part], offsets, self.truncation)
+
+        if self._threads == 1:
+            for part in _batches(slots):
+                add(part)
+        else:  # a block is in one batch, so threads do not meet
+            with ThreadPoolExecutor(self._threads) as pool:
+                list(pool.map(add, _batches(slots)))
 
     def _names_along(self, view: DepthView, cam_from_local: Tensor) -> Tensor:
         """Blocks around the seen points, and along their rays as far as the truncation."""
