@@ -12,6 +12,7 @@ import tyro
 
 from deltas_nets import __version__
 from deltas_nets.commands.command import Command
+from deltas_nets.commands.values import check_values
 from deltas_nets.commands.words import first_page, sentence
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import silent_without_reader, stopped_like_ctrl_c
@@ -32,6 +33,7 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
             return
         command = parse(list(arguments), commands)
         try:
+            check_values(command)
             with stopped_like_ctrl_c():
                 command.run()
         except UserError as error:
@@ -62,7 +64,7 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
             sys.stdout.flush()  # the help, which a reader may have had enough of
             raise
         names = {command.__name__.lower(): command for command in commands}
-        what = sentence(_in_words(said.getvalue()), names)
+        what = sentence(_in_words(said.getvalue()), names, arguments)
         what = shorten(what, 200, placeholder=" ...")
         _fail(UserError(what, "command line", _help_of(arguments, commands)))
     return command

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from inspect import getdoc
+from itertools import takewhile
 from typing import Any
 
 from deltas_nets.commands.command import Command
@@ -41,18 +42,33 @@ def _first_line(command: type[Command]) -> str:
     return (getdoc(command) or "").partition("\n\n")[0].replace("\n", " ")
 
 
-def sentence(said: str, commands: Mapping[str, type[Command]]) -> str:
+def sentence(
+    said: str, commands: Mapping[str, type[Command]], arguments: Sequence[str] = ()
+) -> str:
     """What tyro said in a line, in our words where they are better.
 
     Args:
         said: one line.
         commands: by name.
+        arguments: that it is about.
     """
+    if said.startswith("Unrecognized") and (unquoted := _unquoted(arguments)):
+        return unquoted
     for pattern, words in _SAYINGS:
         match = re.search(pattern, said)
         if match:
             return words(match, commands)
     return said
+
+
+def _unquoted(arguments: Sequence[str]) -> str:
+    """What to say of numbers that the shell took apart; nothing if there are none."""
+    option = "--intrinsics"
+    after = arguments[list(arguments).index(option) + 1 :] if option in arguments else ()
+    numbers = list(takewhile(lambda word: re.fullmatch(r"-?[\d.]+(e-?\d+)?,?", word), after))
+    if len(numbers) < 2:
+        return ""
+    return f'{option} takes its numbers in quotes: {option} "{" ".join(numbers)}"'
 
 
 def _expected(match: re.Match[str], _: Any) -> str:

@@ -1,0 +1,92 @@
+"""Values of flags that make no sense, told at once: before anything heavy is imported."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from deltas_nets.commands.command import Command
+from deltas_nets.errors import UserError
+
+__all__ = ["check_values"]
+
+LEAST_SIDE = 32  # px
+
+
+def check_values(command: Command) -> None:
+    """Refuse what no command can mean by a flag of that name.
+
+    Configs refuse the same, and more; but they are imported with the network.
+
+    Raises:
+        UserError: a value is out of its range, or a file that is to be read is not there.
+    """
+    for field in fields(command):  # type: ignore[arg-type]
+        value, check = getattr(command, field.name), CHECKS.get(field.name)
+        if value is not None and check is not None:
+            check(value, f"--{field.name.replace('_', '-')}")
+
+
+def _range(value: tuple[float, float], flag: str) -> None:
+    near, far = value
+    if not 0 < near < far < math.inf:
+        raise UserError("no range of depth", f"{flag} {near:g} {far:g}", "use 0 < NEAR < FAR")
+
+
+def _size(value: tuple[int, int], flag: str) -> None:
+    if min(value) < LEAST_SIDE:
+        given = " ".join(map(str, value))
+        raise UserError("too small", f"{flag} {given}", f"use HEIGHT WIDTH of {LEAST_SIDE} or more")
+
+
+def _views(value: int, flag: str) -> None:
+    if value < 2:
+        raise UserError("too few views", f"{flag} {value}", "use 2 or more")
+
+
+def _positive(value: float, flag: str) -> None:
+    if not 0 < value < math.inf:
+        raise UserError("no scale", f"{flag} {value:g}", "give a positive number")
+
+
+def _part(value: float, flag: str) -> None:
+    if not 0 <= value <= 1:
+        raise UserError("no confidence", f"{flag} {value:g}", "use 0 to 1")
+
+
+def _capture(value: Path, _: str) -> None:
+    if not value.exists():
+        raise UserError("the capture does not exist", value, "check the path")
+
+
+def _file(value: Path, flag: str) -> None:
+    if not value.is_file():
+        raise UserError("the file does not exist", f"{flag} {value}", "check the path")
+
+
+def _depths(value: Path, flag: str) -> None:
+    if str(value) != "sensor":
+        _file(value, flag)
+
+
+def _intrinsics(value: str, flag: str) -> None:
+    from deltas_nets.captures.camera_words import Intrinsics
+
+    Intrinsics.parse(value, flag)
+
+
+CHECKS: Mapping[str, Callable[[Any, str], None]] = {
+    "depth_range": _range,
+    "size": _size,
+    "work_size": _size,
+    "views": _views,
+    "scale": _positive,
+    "depth_scale": _positive,
+    "min_confidence": _part,
+    "capture": _capture,
+    "view_sets": _file,
+    "scale_from": _depths,
+    "intrinsics": _intrinsics,
+}
+"""By the name of a field, which means the same in all commands."""
