@@ -30,8 +30,8 @@ MOST_POINTS, MOST_FACES = 200_000, 200_000
 SURE = 0.5
 """Confidence from which points of maps are shown."""
 SMALLEST_DEPTH = 1e-9
-MAPS_OF_CLOUD, POINTS_OF_MAP = 120, 30_000
-"""At most so many maps are read for their points, and so many points of each."""
+MAPS_OF_CLOUD, POINTS_OF_CLOUD = 120, 1_200_000
+"""At most so many maps are read for their points, and so many points of all of them."""
 
 
 class Layer(NamedTuple):
@@ -138,15 +138,18 @@ def points_of_maps(maps: Maps) -> SurePoints:
     """
     xyz, rgb = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     confidence = [np.zeros(0, np.float32)]
-    for id in spread(maps.ids, MAPS_OF_CLOUD):
+    read_ids = spread(maps.ids, MAPS_OF_CLOUD)
+    of_each = POINTS_OF_CLOUD // len(read_ids)
+    for id in read_ids:
         read = maps.points(id)
         if read is None:
             continue
         points, colors = read
-        some = slice(None, None, -(-len(points) // POINTS_OF_MAP) or 1)
-        xyz.append(points[some])
-        rgb.append(colors[some])
-        confidence.append(_confidence_at(points[some], maps, id))
+        # Copies: a slice would keep all of a file's points in memory.
+        some = slice(None, None, -(-len(points) // of_each) or 1)
+        xyz.append(points[some].copy())
+        rgb.append(colors[some].copy())
+        confidence.append(_confidence_at(xyz[-1], maps, id))
     return SurePoints(Surface(np.concatenate(xyz), np.concatenate(rgb)), np.concatenate(confidence))
 
 
