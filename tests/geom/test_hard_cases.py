@@ -16,7 +16,7 @@ from torch import Tensor
 from deltas_geom import refine_points, reprojection_residual, triangulate, triangulate_points
 
 DIGITS = 60
-COUNT = 30  # points of a case
+COUNT = 16  # points of a case
 DEPTH = 4.0  # of the points from the rig, in metres
 CASES = (
     "1 degree at f = 3000",
