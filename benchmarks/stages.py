@@ -44,7 +44,7 @@ def main() -> None:
                 assert metrics is not None
                 found[f"posterior, {number} rounds of exchange"].append(metrics)
             points = score_points(result.prediction, truth, config.depth_range)
-            dense = depth_metrics(result.depth, truth)
+            dense = depth_metrics(result.map.depth, truth)
             assert points is not None
             assert dense is not None
             found["refined and triangulated"].append(points)

@@ -5,6 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -50,6 +51,10 @@ class Header(NamedTuple):
     mode: str
 
 
+_REMEMBERING = Lock()
+"""Of all memories, which threads share; not a part of them, as they are copied with captures."""
+
+
 class ImageMemory:
     """Decoded images, those used last.
 
@@ -64,14 +69,18 @@ class ImageMemory:
 
     def get(self, name: Hashable, read: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """The pixels of a name, from ``read`` if they are not known."""
-        if name not in self._known:
-            self._known[name] = read()
-            self._used += self._known[name].nbytes
-        pixels = self._known[name]
-        self._known.move_to_end(name)
-        while self._used > self.capacity:
-            _, forgotten = self._known.popitem(last=False)
-            self._used -= forgotten.nbytes
+        with _REMEMBERING:
+            pixels = self._known.get(name)
+        if pixels is None:
+            pixels = read()
+        with _REMEMBERING:
+            if name not in self._known:  # another thread may have been faster
+                self._known[name] = pixels
+                self._used += pixels.nbytes
+            self._known.move_to_end(name)
+            while self._used > self.capacity:
+                _, forgotten = self._known.popitem(last=False)
+                self._used -= forgotten.nbytes
         return pixels
 
 

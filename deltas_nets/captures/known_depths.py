@@ -18,12 +18,13 @@ SOME = 2000
 """Pixels of sensor depth that are looked at."""
 
 
-def points_in_view(capture: Capture, position: int) -> FloatArray | None:
+def points_in_view(capture: Capture, position: int, *, least: int = ENOUGH) -> FloatArray | None:
     """Sparse points that a frame sees, or would see where no one says so, in its camera's axes.
 
     Args:
         capture: the frames.
         position: of the frame among them.
+        least: fewer are none.
 
     Returns:
         ``(D, 3)`` in front of it; None where there are too few.
@@ -40,7 +41,7 @@ def points_in_view(capture: Capture, position: int) -> FloatArray | None:
         x, y, w = (found @ capture.frames.K[position].T).T
         height, width = capture.frames.image_sizes[position]
         found = found[(abs(2 * x / w - width) < width) & (abs(2 * y / w - height) < height)]
-    return found if len(found) >= ENOUGH else None
+    return found if len(found) >= least else None
 
 
 def depths_of_sensor(capture: Capture, position: int) -> FloatArray | None:

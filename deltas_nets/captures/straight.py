@@ -16,7 +16,7 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frame import Lens as FrameLens
 from deltas_nets.captures.images import resize_image
 
-__all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight"]
+__all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight", "straight_pixels"]
 
 WIDEST = np.cos(np.radians(60))
 """What a lens sees farther off its axis is left out: a straight image of it would be all border."""
@@ -167,3 +167,16 @@ def photo_pixels(
     rays = pixel_rays(camera.resized(size), pixels.double().cpu())
     seen = _Seen.of(frame.photo).resized(photo_size).project(rays).pixels
     return seen.to(pixels)
+
+
+def straight_pixels(
+    frame: StraightFrame, pixels: torch.Tensor
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Where pixels ``(N, 2)`` of the photo are in the straight image, and which it shows."""
+    rays, valid = _Seen.of(frame.photo).resized(frame.photo.image_size).unproject(pixels.double())
+    ahead = valid & (rays[:, 2] > 0)
+    x, y, w = (torch.where(ahead[:, None], rays, 1.0) @ torch.from_numpy(frame.K).mT).T
+    found = torch.stack([x / w, y / w], dim=-1)
+    width_height = torch.tensor(frame.image_size[::-1])
+    inside = ((found >= -0.5) & (found < width_height - 0.5)).all(dim=-1)
+    return found.numpy(), (ahead & inside).numpy()

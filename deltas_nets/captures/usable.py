@@ -72,6 +72,12 @@ def usable_view_sets(
     return UsableViews(view_sets, sum(len(views.sources) < wanted - 1 for views in view_sets))
 
 
+def lone_frames(capture: Capture, anchors: Sequence[str] | None) -> UsableViews:
+    """Frames without sources, for maps that rest on measured depth alone; all if none are named."""
+    chosen = capture.frames if anchors is None else anchors
+    return UsableViews(tuple(ViewSet(id, ()) for id in chosen), 0)
+
+
 def _tell_of_short(found: ChosenViews, wanted: int) -> None:
     """Warn of sets with fewer views than asked, and say why."""
     count = sum(found.short.values())

@@ -1,5 +1,6 @@
 """The command `deltas depth`."""
 
+import os
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,7 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible
+from deltas_nets.commands.depth_telling import show, tell
+from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible, usable_device
+from deltas_nets.commands.fuse import fuse_maps
+from deltas_nets.commands.measuring import Measuring
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
@@ -18,9 +22,9 @@ if TYPE_CHECKING:
     from deltas_nets.captures.usable import UsableViews
     from deltas_nets.outputs.folder import OutputFolder
     from deltas_nets.outputs.products import OutputOptions
-    from deltas_nets.predict.capture import Outcome
     from deltas_nets.predict.depth_map import PredictConfig
     from deltas_nets.predict.predictor import Predictor
+    from deltas_nets.predict.search import Search
 
 
 def read_shard(text: str) -> tuple[int, int]:
@@ -36,7 +40,7 @@ def read_shard(text: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Depth(Captured, Prediction):
+class Depth(Captured, Measuring, Prediction):
     """Write a depth map for every frame of a posed capture.
 
     The capture is a COLMAP model with its photos, a transforms.json, a phone's or a tracker's
@@ -74,6 +78,15 @@ class Depth(Captured, Prediction):
     """Size of the maps; the colour image's if not given."""
     min_confidence: float = 0.0
     """Leave out pixels of less confidence, 0 to 1."""
+    passes: int = 2
+    """2 lets each map hear those of the frames around it, where three or more agree on a place; 1
+    is the network alone."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Maps computed at once, each by one thread; as many as there are cores if not given."""
+    mesh: Flag = False
+    """Fuse the maps at the end: mesh.ply in the folder; `deltas fuse` has more options."""
+    cloud: Flag = False
+    """The same: cloud.ply."""
     page: bool = True
     """Also write index.html to look at, contact_sheet.jpg and preview/ID.jpg."""
     shard: str = "1/1"
@@ -86,14 +99,14 @@ class Depth(Captured, Prediction):
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.captures.keyframes import keyframes
-        from deltas_nets.captures.usable import check_all, usable_view_sets, warn_of
+        from deltas_nets.captures.usable import check_all, lone_frames, usable_view_sets, warn_of
         from deltas_nets.captures.working_depth import knows_its_scale
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
         from deltas_nets.predict.capture import predict_capture
         from deltas_nets.predict.first_look import ANCHORS, ROUNDS, depth_seen
-        from deltas_nets.predict.search import Asked, Followed
 
         shard = read_shard(self.shard)
+        self._check()
         config = self.config(size=self.size, min_confidence=self.min_confidence)
         options = self._options()
         capture = self.opened(self.capture).remembering()
@@ -103,13 +116,13 @@ class Depth(Captured, Prediction):
         if not knows_its_scale(capture):  # then a few maps tell, before views are chosen
             with progress("first look", ROUNDS * ANCHORS) as report:
                 depth = depth_seen(predictor, capture, config, report=report)
-        found = usable_view_sets(
-            capture,
-            self.view_sets,
-            self.views,
-            working_depth=depth,
-            anchors=keyframes(capture, working_depth=depth) if self.keyframes else None,
-        )
+        anchors = keyframes(capture, working_depth=depth) if self.keyframes else None
+        if self.views == 1:
+            found = lone_frames(capture, anchors)
+        else:
+            found = usable_view_sets(
+                capture, self.view_sets, self.views, working_depth=depth, anchors=anchors
+            )
         check_all(capture, found.view_sets)
         warn_of(capture, found.view_sets, self.view_sets, self.range)
         for finding in quick_findings(capture):
@@ -119,22 +132,58 @@ class Depth(Captured, Prediction):
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)
         mine = found.view_sets[shard[0] - 1 :: shard[1]]
+        search = self._search(capture)
         folder = self._folder(capture, found, shard, options, predictor, config)
-        search = Followed(capture) if self.depth_range is None else Asked(capture, self.depth_range)
-        with progress("depth", len(mine)) as report:
-            outcome = predict_capture(
-                predictor,
-                capture,
-                mine,
-                folder,
-                config,
-                search=search,
-                short=found.short,
-                report=report,
-            )
-        self._tell(outcome, folder, options)
+        outcome = predict_capture(
+            predictor,
+            capture,
+            mine,
+            folder,
+            config,
+            search=search,
+            short=found.short,
+            passes=self.passes,
+            threads=self._threads(len(mine)),
+            progress=progress,
+        )
+        tell(outcome, folder, options, self.format)
+        if self.mesh or self.cloud:
+            wanted = {"mesh": self.mesh, "cloud": self.cloud}
+            fuse_maps(capture, self.folder, wanted, self.device, overwrite=self.overwrite)
         if self.page:
-            self._show(capture)
+            show(capture, self.folder, self.range)
+
+    def _check(self) -> None:
+        if self.passes not in (1, 2):
+            raise UserError("there is no such pass", f"--passes {self.passes}", "use 1 or 2")
+        if self.workers is not None and self.workers < 1:
+            raise UserError("too few workers", f"--workers {self.workers}", "use 1 or more")
+        if self.views == 1 and self.sensor_depth is None:
+            what = "one view alone has no depth"
+            raise UserError(what, "--views 1", "use 2 or more, or add --sensor-depth")
+
+    def _search(self, capture: "Capture") -> "Search":
+        from deltas_nets.predict.search import Asked, Completed, Followed
+
+        measured = self.measured(capture)
+        if self.views == 1:
+            assert measured is not None  # or `_check` would have refused
+            return Completed(capture, measured)
+        if self.depth_range is None:
+            return Followed(capture, measured)
+        return Asked(capture, self.depth_range, measured)
+
+    def _threads(self, maps: int) -> int:
+        """Maps at once: a core each, as cores that share a map wait for each other."""
+        from deltas_nets.predict.capture import FEWEST
+
+        if self.workers is not None or usable_device(self.device) != "cpu" or maps < FEWEST:
+            return self.workers or 1
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        count = min(cores or 1, maps)
+        if count > 1:
+            print(f"{count} maps at a time, a core each (--workers)")
+        return count
 
     def _options(self) -> "OutputOptions":
         from deltas_nets.outputs.products import OutputOptions
@@ -193,6 +242,8 @@ class Depth(Captured, Prediction):
                 "precision": self.precision,
                 "views": self.views,
                 "view_sets": view_sets_in_json(views.view_sets),
+                "passes": self.passes,
+                **self.measured_record(),
                 **{name: value for name, (value, usual) in unusual.items() if value != usual},
             },
             overwrite=self.overwrite,
@@ -214,53 +265,3 @@ class Depth(Captured, Prediction):
     def folder(self) -> Path:
         """Where outputs go."""
         return self.out or Path(f"{self.capture.resolve().stem}-depth")
-
-    def _show(self, capture: "Capture") -> None:
-        """Write the page; maps are worth more, so what hinders it is only a warning."""
-        from deltas_nets.outputs.summary import SUMMARY, read_summary
-        from deltas_nets.page.maps import open_maps
-        from deltas_nets.page.write import write_page
-
-        if (read_summary(self.folder / SUMMARY) or {}).get("status") != "complete":
-            return  # another shard does it
-        try:
-            maps = open_maps(capture, self.folder)
-            with progress("page", len(maps.ids)) as report:
-                page = write_page(maps, depth_range=self.range, report=report)
-            print(page.line)
-        except UserError as error:
-            warn(f"no page to look at is written: {error}; deltas page goes on from there")
-
-    def _tell(self, outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions") -> None:
-        """What became of it all, in a few lines."""
-        from deltas_nets.outputs.summary import SUMMARY, read_summary
-
-        kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
-        maps = "1 depth map" if outcome.written == 1 else f"{outcome.written} depth maps"
-        print(f"{maps} in {self.folder}{kept}")
-        if options.unit != "metre":
-            steps = (
-                f", {options.depth_scale:g} steps of a PNG in it" if self.format == "png" else ""
-            )
-            print(f"depth is in {options.unit}{steps}; --scale METRES makes it metric")
-        if not options.confidence:
-            print("no confidence is written: the reference network states none")
-        if outcome.blind:
-            warn(f"{outcome.blind} maps without a triangulated point are guesses: see summary.json")
-        if outcome.piled:
-            warn(
-                f"points of {outcome.piled} maps pile up at an end of the depth that was searched: "
-                "is --depth-range too narrow, or a pose wrong? See summary.json"
-            )
-        saturated = sum("saturated_pixels" in record for record in folder.frames.values())
-        if saturated:
-            most = f"{options.max_depth:g} {'m' if options.unit == 'metre' else 'units'}"
-            warn(
-                f"{saturated} maps have depth beyond {most} that is written as {most}: add "
-                f"--depth-scale {options.depth_scale / 10:g} or --format npz; see summary.json"
-            )
-        if outcome.verdict is not None:
-            (warn if outcome.verdict.doubtful else print)(outcome.verdict.line)
-        waiting = (read_summary(self.folder / SUMMARY) or {}).get("waiting_for", ())
-        if waiting:
-            print(f"the folder is complete after --shard {', '.join(waiting)}")

@@ -54,7 +54,7 @@ def run_demo(
         result = predict_frame(EncodedFrames(model), [pair.left, pair.right], config)
     elapsed = time.perf_counter() - started
     seconds = _seconds_by_stage(laps)
-    dense = depth_metrics(result.depth, pair.depth, depth_range=config.depth_range)
+    dense = depth_metrics(result.map.depth, pair.depth, depth_range=config.depth_range)
     sparse = score_points(result.prediction, pair.depth, config.depth_range)
     assert dense is not None
     assert sparse is not None
@@ -68,7 +68,9 @@ def run_demo(
         "sparse": sparse._asdict() | {"median_relative_error": median},
     }
     folder.write_frame(
-        FrameOutput(pair.left, result.depth, result.confidence, result.points, result.colors),
+        FrameOutput(
+            pair.left, result.map.depth, result.map.confidence, result.map.points, result.map.colors
+        ),
         record,
     )
     figure = out / "demo.png"

@@ -31,7 +31,7 @@ def draw_prediction(
     Args:
         path: of the picture.
         result: a prediction from the anchor and at least one source; the first is drawn.
-        truth: ``(H, W)`` true depth at the size of ``result.depth``, 0 = unknown.
+        truth: ``(H, W)`` true depth at the size of ``result.map.depth``, 0 = unknown.
         depth_range: of the search: the segments' ends.
         title: above the panels.
     """
@@ -49,9 +49,9 @@ def draw_prediction(
         axis.imshow(shown, cmap=DEPTH_COLORS, vmin=limits[0], vmax=limits[1])
         axis.set_title(name)
 
-    draw_depth(axes[1, 0], result.depth, "dense depth")
+    draw_depth(axes[1, 0], result.map.depth, "dense depth")
     draw_depth(axes[1, 1], truth, "true depth")
-    error = np.ma.masked_where(~known, np.abs(result.depth - truth) / np.where(known, truth, 1))
+    error = np.ma.masked_where(~known, np.abs(result.map.depth - truth) / np.where(known, truth, 1))
     errors = error.compressed()
     drawn = axes[1, 2].imshow(100 * error, cmap="magma", vmin=0, vmax=20)
     axes[1, 2].set_title(

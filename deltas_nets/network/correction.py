@@ -25,7 +25,7 @@ LIKENESS = 0.15
 ROUGHNESS = 0.03
 """Standard deviation of what no neighbour shares: the map's own noise."""
 MOST = 512
-"""Places that the process is conditioned on; of more known depths the surest of each cell count."""
+"""Places that the process is conditioned on."""
 TOLERANCE, ROUNDS = 3.0, 6
 """Standard deviations by which a depth may differ from what the others predict, and how often that
 is asked."""
@@ -35,11 +35,11 @@ class Places(NamedTuple):
     """Pixels of a map, M of them.
 
     Attributes:
-        index: ``(B, M)`` int64 in the flat image.
+        pixels: ``(B, M)`` int64 in the flat image.
         position: ``(B, M, 3)`` column, row and log depth, each in units of its reach.
     """
 
-    index: Tensor
+    pixels: Tensor
     position: Tensor
 
     @classmethod
@@ -94,20 +94,23 @@ def covariance(one: Places, other: Places) -> Tensor:
     return SHARED**2 + LOCAL**2 * torch.exp(-0.5 * squares)
 
 
-def correction(known: SparseDepth, variance: Tensor, log_depth: Tensor) -> Correction:
+def correction(
+    known: SparseDepth, variance: Tensor, log_depth: Tensor, *, most: int = MOST
+) -> Correction:
     """Condition the process on known depths.
 
     Args:
-        known: ``(B, 1, H, W)`` points; more than `MOST` are thinned, the surest of a cell stays.
+        known: ``(B, 1, H, W)`` points.
         variance: ``(B, 1, H, W)`` of the log of their depth.
         log_depth: ``(B, 1, H, W)`` of the map.
+        most: of more points the surest of each cell stays.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), equations 2.23
     and 5.12; where a depth is off by more than `TOLERANCE` of what the others leave open, its
     noise grows.
     """
     height, width = log_depth.shape[-2:]
-    cell = max(1, math.ceil(math.sqrt(height * width / MOST)))
+    cell = max(1, math.ceil(math.sqrt(height * width / most)))
     weight, index = F.max_pool2d(known.weight, cell, ceil_mode=True, return_indices=True)
     index, used = positive(weight.flatten(1), index.flatten(1))
     places = Places.at(index, at_least_single(log_depth))

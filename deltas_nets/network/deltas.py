@@ -20,7 +20,7 @@ from deltas_nets.config import NetworkConfig
 from deltas_nets.network.build import build_stages
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.image_range import check_images
-from deltas_nets.network.known_depth import KnownDepth, reconciled
+from deltas_nets.network.known_depth import KnownDepth, as_points, reconciled
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.densifier import DenseDepth
@@ -81,8 +81,7 @@ class DepthPrediction(Record):
 
     def confidence(self, tolerance: float = 0.05) -> Tensor:
         """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``."""
-        relative_scale = self.std / self.depth / 2**0.5
-        return 1 - torch.exp(-tolerance / relative_scale.clamp_min(1e-6))
+        return KnownDepth(self.depth, self.std / self.depth).confidence(tolerance)
 
 
 class Deltas(nn.Module):
@@ -274,6 +273,19 @@ class Deltas(nn.Module):
         # A Laplace distribution deviates by sqrt(2) of its scale.
         log_std = upsample_to(dense.log_spread, size) + 0.5 * math.log(2)
         return Densified(dense, depth, self.calibration(log_std, num_views).exp() * depth)
+
+    def complete(self, encoded: Encoded, known: KnownDepth) -> Densified:
+        """A map of one image and depth that is known of it; no other view is looked at.
+
+        Args:
+            encoded: of B images.
+            known: ``(B, 1, H, W)``.
+        """
+        # The standard deviation is that of two views: there is no curve for one.
+        first = self.densified(encoded, as_points(known), num_views=2)
+        nothing = SparseDepth(*(torch.zeros_like(part) for part in known))
+        believed = reconciled(nothing, known, first.dense.log_depth[0])
+        return self.densified(encoded, believed, num_views=2)
 
 
 def _flat_maps(known: KnownDepth) -> KnownDepth:

@@ -4,8 +4,6 @@ A sensor, the maps of other frames and the sparse points of a reconstruction ent
 the same slot as the triangulated points: as points with a weight.
 """
 
-from typing import Self
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -33,7 +31,7 @@ HALVED_BY = 0.03
 
 
 class KnownDepth(Record):
-    """Depth that is known at some pixels of the anchor.
+    """Depth that is known at some pixels of the anchor, or at all, with its uncertainty.
 
     Attributes:
         depth: ``(*B, 1, H, W)`` metres along z; 0 where it is unknown.
@@ -43,13 +41,10 @@ class KnownDepth(Record):
     depth: Tensor
     deviation: Tensor
 
-    def surest(self, other: Self) -> Self:
-        """At each pixel the surer of two."""
-        better = (self.depth > 0) & ((other.depth <= 0) | (self.deviation <= other.deviation))
-        return type(self)(
-            torch.where(better, self.depth, other.depth),
-            torch.where(better, self.deviation, other.deviation),
-        )
+    def confidence(self, tolerance: float = 0.05) -> Tensor:
+        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``."""
+        relative_scale = self.deviation / 2**0.5  # of a Laplace distribution
+        return 1 - torch.exp(-tolerance / relative_scale.clamp_min(1e-6))
 
 
 def as_points(known: KnownDepth) -> SparseDepth:
@@ -126,7 +121,7 @@ def _doubt(process: Correction, points: SparseDepth, variance: Tensor, log_depth
     doubt = torch.where(used, ((off - process(places)).abs() / usual).clamp(1, 30) ** 4, 1.0)
     image = torch.ones_like(points.weight).flatten(1).scatter(-1, index, doubt)
     # What the process rests on has been judged by the others.
-    image = image.scatter(-1, process.places.index, process.doubt)
+    image = image.scatter(-1, process.places.pixels, process.doubt)
     return image.reshape(points.weight.shape)
 
 

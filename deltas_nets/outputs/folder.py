@@ -13,6 +13,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from deltas_nets.captures.ids import id_in_json
@@ -66,6 +67,8 @@ class OutputFolder:
         self._shard = shard
         own = path / SUMMARY if shard[1] == 1 else shard_summary(path, shard)
         self._journal = Journal(own)
+        self._begun: dict[str, Any] = {}
+        self._lock = Lock()
 
     def file(self, product: str, id: str) -> Path:
         """Where a product of a frame is written."""
@@ -76,7 +79,7 @@ class OutputFolder:
         return all(product.file(self.path, id).exists() for product in self.products)
 
     def write_frame(self, frame: FrameOutput, record: Mapping[str, Any]) -> None:
-        """Write a frame's files.
+        """Write a frame's files; several threads may, each another's.
 
         Args:
             frame: what is known of it; with a confidence where the folder's options say so.
@@ -89,10 +92,13 @@ class OutputFolder:
             raise ValueError(f"the folder's options are {self._options}")
         id, record = frame.anchor.id, {**record, **remarks_on(frame, self._options)}
         # First: a frame is finished with the last of its files, and then it has a record.
-        self._journal.add(id, record)
+        with self._lock:
+            self._begun[id] = record
+            self._journal.add(id, record)
         for product in reversed(self.products):
             product.write(product.file(self.path, id), frame, self._options)
-        self.frames[id] = record
+        with self._lock:
+            self.frames[id] = self._begun.pop(id)
 
     def keep_frame(self, id: str) -> None:
         """Count a frame that an earlier run finished; its record is kept where it had one."""
@@ -116,13 +122,16 @@ class OutputFolder:
             status: of this run: ``running``, ``stopped`` or ``complete``.
             more: goes to the summary beside the settings (times, counts).
         """
-        self._head = self._head | more
-        content = self._head | {"status": status, "frames": self.frames}
-        if self._shard[1] > 1:
-            write_shard_summary(self.path, self._shard, content)
-        else:
-            write_json(self.path / SUMMARY, content)
-        self._journal.remove()
+        with self._lock:
+            self._head = self._head | more
+            content = self._head | {"status": status, "frames": self.frames}
+            if self._shard[1] > 1:
+                write_shard_summary(self.path, self._shard, content)
+            else:
+                write_json(self.path / SUMMARY, content)
+            self._journal.remove()
+            for id, record in self._begun.items():
+                self._journal.add(id, record)
 
 
 def prepare_output(

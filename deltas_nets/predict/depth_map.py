@@ -12,6 +12,7 @@ from deltas_geom import PosedViews, unproject
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.network.deltas import DepthPrediction
+from deltas_nets.network.known_depth import KnownDepth
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,13 @@ class KeypointDepths(NamedTuple):
     depth: torch.Tensor
     image_size: tuple[int, int]
 
+    @classmethod
+    def of(cls, depth: torch.Tensor) -> "KeypointDepths":
+        """All pixels of an image ``(1, H, W)`` that have a depth."""
+        rows, columns = depth[0].nonzero().unbind(dim=-1)
+        pixels = torch.stack([columns, rows], dim=-1).to(depth)
+        return cls(pixels, depth[0, rows, columns], (depth.shape[-2], depth.shape[-1]))
+
 
 class DepthMap(NamedTuple):
     """What any network says of a frame: what is written and scored.
@@ -66,6 +74,8 @@ class DepthMap(NamedTuple):
         keypoints: the points that the map rests on.
         log_std: ``(1, h, w)`` log of the standard deviation as a share of the depth, at the size
             that the network works at; None where the network states none.
+        work: ``(1, h, w)`` what the network says, at that size and of the straight image where
+            a lens bends lines, in the capture's unit; None where it states no deviation.
     """
 
     depth: NDArray[np.float32]
@@ -74,6 +84,22 @@ class DepthMap(NamedTuple):
     colors: NDArray[np.uint8]
     keypoints: KeypointDepths
     log_std: torch.Tensor | None = None
+    work: KnownDepth | None = None
+
+
+def finished_map(
+    anchor: Frame, work: KnownDepth, keypoints: KeypointDepths, config: PredictConfig
+) -> DepthMap:
+    """What is written and scored of a map ``(1, h, w)`` at the size that the network works at."""
+    size = config.size or anchor.image_size
+    depth = resized(work.depth, size)
+    confidence = resized(work.confidence(), size)
+    kept = confidence >= config.min_confidence
+    work_size = (work.depth.shape[-2], work.depth.shape[-1])
+    points, colors = point_cloud(anchor, depth * kept, size, work_size)
+    # In logs, as the network forms it: the order of neighbours stays.
+    log_std = work.deviation.log()
+    return DepthMap(np.where(kept, depth, 0), confidence, points, colors, keypoints, log_std, work)
 
 
 def keypoint_depths(prediction: DepthPrediction) -> KeypointDepths:

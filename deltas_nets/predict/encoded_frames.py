@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 import torch
@@ -44,6 +45,7 @@ class EncodedFrames:
         self.model = model
         self.capacity = capacity
         self._known: OrderedDict[_Key, EncodedImages] = OrderedDict()
+        self._lock = Lock()  # threads share it; at worst two encode the same frame
 
     @torch.inference_mode()
     def __call__(self, frames: Sequence[Frame], *, work_size: tuple[int, int]) -> EncodedImages:
@@ -57,22 +59,25 @@ class EncodedFrames:
             UserError: an image cannot be read.
         """
         keys = [(frame.image_path, frame.image_span, work_size) for frame in frames]
-        new = {
-            key: frame for key, frame in zip(keys, frames, strict=True) if key not in self._known
-        }
-        views = {key: self._known[key] for key in keys if key not in new}
-        if new:
-            device = next(self.model.parameters()).device
-            images = torch.stack([load_image(frame, work_size=work_size) for frame in new.values()])
-            encoded = self.model.encode(images.to(device)[None]).each()
-            for key, image, view in zip(new, images, encoded, strict=True):
-                views[key] = EncodedImages(image, view)
-        for key in keys:
-            self._known[key] = views[key]
-            self._known.move_to_end(key)
-        while len(self._known) > self.capacity:
-            self._known.popitem(last=False)
+        with self._lock:
+            views = {key: self._known[key] for key in keys if key in self._known}
+        for key, frame in zip(keys, frames, strict=True):
+            if key not in views:
+                views[key] = self._encoded(frame, work_size)
+        with self._lock:
+            for key in keys:
+                self._known[key] = views[key]
+                self._known.move_to_end(key)
+            while len(self._known) > self.capacity:
+                self._known.popitem(last=False)
         return EncodedImages(
             torch.stack([views[key].images for key in keys]),
             Encoded.joined([views[key].encoded for key in keys]),
         )
+
+    def _encoded(self, frame: Frame, work_size: tuple[int, int]) -> EncodedImages:
+        """One image alone, so that what comes out does not depend on which others are known."""
+        image = load_image(frame, work_size=work_size)
+        device = next(self.model.parameters()).device
+        (encoded,) = self.model.encode(image.to(device)[None, None]).each()
+        return EncodedImages(image, encoded)

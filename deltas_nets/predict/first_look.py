@@ -1,6 +1,5 @@
 """What a few maps tell of a whole capture: how far its surfaces are, how long its unit is."""
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.known_depths import points_in_view
-from deltas_nets.captures.text_lines import read_lines
+from deltas_nets.captures.measured import measured_by_hand
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image
@@ -107,29 +106,16 @@ def scale_by_measurements(
     Raises:
         UserError: the file is malformed, or names a frame or pixel that there is not.
     """
-    form = "write lines ID X Y METRES: a frame, a pixel and its depth"
-    search, ratios, maps = Followed(capture), [], {}
-    for number, words in read_lines(file, name="file of measured depths", remedy=form):
-        try:
-            id, (x, y, metres) = words[0], (float(word) for word in words[1:])
-        except ValueError as error:
-            raise UserError(f"line {number} is not ID X Y METRES", file, form) from error
-        if id not in maps:
-            (views,) = _some(capture, anchors=[capture.frame(id).id])
-            maps[id] = search(predictor, views, config).map.depth
-        if not 0 < metres < math.inf:
-            raise UserError(f"line {number}: {metres:g} m is no depth", file, form)
-        height, width = maps[id].shape
-        if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
-            what = f"line {number}: pixel ({x:g}, {y:g}) is outside of frame {id}, {width}x{height}"
-            raise UserError(what, file, "give pixels of the photo: x to the right, y down")
-        found = float(maps[id][round(y), round(x)])
-        if found == 0:
-            what = f"line {number}: no depth was found at pixel ({x:g}, {y:g}) of frame {id}"
-            raise UserError(what, file, "measure nearer to the middle of the photo")
-        ratios.append(metres / found)
-    if not ratios:
-        raise UserError("the file of measured depths is empty", file, form)
+    search, ratios = Followed(capture), []
+    for id, rows in measured_by_hand(file, capture).items():
+        (views,) = _some(capture, anchors=[id])
+        depth = search(predictor, views, config).map.depth
+        for x, y, metres in rows:
+            found = float(depth[round(y), round(x)])
+            if found == 0:
+                what = f"no depth was found at pixel ({x:g}, {y:g}) of frame {id}"
+                raise UserError(what, file, "measure nearer to the middle of the photo")
+            ratios.append(metres / found)
     return float(np.median(ratios))
 
 

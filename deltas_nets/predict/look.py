@@ -7,16 +7,21 @@ import numpy as np
 import torch
 
 from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, resized
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
 
-__all__ = ["found_depths", "look"]
+__all__ = ["as_photographed", "found_depths", "look"]
 
 
 def look(
-    predictor: Predictor, frames: Sequence[Frame], config: PredictConfig, reach: Reach
+    predictor: Predictor,
+    frames: Sequence[Frame],
+    config: PredictConfig,
+    reach: Reach,
+    measured: MeasuredDepth | None = None,
 ) -> DepthMap:
     """Depth of the first frame, as its photo shows it, in the capture's unit.
 
@@ -25,6 +30,7 @@ def look(
         frames: the anchor and its sources.
         config: all but the range.
         reach: what is searched.
+        measured: what is known of the anchor, in the capture's unit.
 
     Raises:
         UserError: an image cannot be read.
@@ -32,14 +38,19 @@ def look(
     unit = reach.unit
     config = replace(config, depth_range=(reach.near * unit, reach.far * unit))
     seen = [_in_unit(straight(frame), unit) for frame in frames]
-    anchor = seen[0]
-    if isinstance(anchor, StraightFrame):
-        size = config.size or anchor.photo.image_size
-        found = predictor.depth_map(seen, replace(config, size=None))
-        found = _as_photographed(found, anchor, size)
-    else:
-        found = predictor.depth_map(seen, config)
-    return found if unit == 1 else _in_units_of_capture(found, unit)
+    if measured is not None:
+        measured = measured._replace(depth=measured.depth * unit)
+    of_straight = replace(config, size=None) if isinstance(seen[0], StraightFrame) else config
+    found = predictor.depth_map(seen, of_straight, measured)
+    found = found if unit == 1 else _in_units_of_capture(found, unit)
+    return as_photographed(found, seen[0], config)
+
+
+def as_photographed(found: DepthMap, anchor: Frame, config: PredictConfig) -> DepthMap:
+    """The map of a frame made straight, for the pixels of its photo."""
+    if not isinstance(anchor, StraightFrame):
+        return found
+    return _through_lens(found, anchor, config.size or anchor.photo.image_size)
 
 
 def found_depths(found: DepthMap) -> FloatArray:
@@ -61,10 +72,11 @@ def _in_units_of_capture(found: DepthMap, unit: float) -> DepthMap:
         depth=found.depth / np.float32(unit),
         points=found.points / unit,
         keypoints=found.keypoints._replace(depth=found.keypoints.depth / unit),
+        work=None if found.work is None else found.work._replace(depth=found.work.depth / unit),
     )
 
 
-def _as_photographed(found: DepthMap, anchor: StraightFrame, size: tuple[int, int]) -> DepthMap:
+def _through_lens(found: DepthMap, anchor: StraightFrame, size: tuple[int, int]) -> DepthMap:
     """The map of a straight image, for the pixels of the photo; 0 beyond what that shows."""
     place = pixels_of_photo(anchor, size)
     outside = place < 0

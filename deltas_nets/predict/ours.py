@@ -4,22 +4,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from deltas_geom import PosedViews
+from deltas_geom import PosedViews, rasterize_depth
+from deltas_geom.cameras.pixels import resize_pixels
 from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import anchor_views, fit_work_size
 from deltas_nets.config import to_dict
+from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas, DepthPrediction, with_batch_dims
+from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import (
     DepthMap,
+    KeypointDepths,
     PredictConfig,
+    finished_map,
     keypoint_depths,
-    point_cloud,
-    resized,
 )
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.weights_file import weights_record
@@ -32,19 +34,13 @@ class FrameDepth(NamedTuple):
     """Depth of one frame.
 
     Attributes:
-        depth: ``(H, W)`` float32 metres; 0 where ``min_confidence`` removed it.
-        confidence: ``(H, W)`` float32, probability that the relative error is below 5 %.
-        points: ``(N, 3)`` float64 in the capture's world, metres.
-        colors: ``(N, 3)`` uint8.
+        map: what is written and scored.
         prediction: what the network gave, at the size it works at.
         images: ``(V, 3, h, w)`` the frames as the network saw them.
         views: the cameras, relative to the anchor, at the network's size.
     """
 
-    depth: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    map: DepthMap
     prediction: DepthPrediction
     images: torch.Tensor
     views: PosedViews
@@ -69,19 +65,16 @@ class DeltasPredictor:
     ) -> None:
         """It can do all of it."""
 
-    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
-        """Depth of the first frame from all of them."""
-        found = predict_frame(self.encode, frames, config)
-        prediction = found.prediction
-        return DepthMap(
-            found.depth,
-            found.confidence,
-            found.points,
-            found.colors,
-            keypoint_depths(prediction),
-            # In logs, as the network forms it: the order of neighbours stays.
-            (prediction.std / prediction.depth).log(),
-        )
+    def depth_map(
+        self,
+        frames: Sequence[Frame],
+        config: PredictConfig,
+        measured: MeasuredDepth | None = None,
+    ) -> DepthMap:
+        """Depth of the first frame from all of them, and from what was measured."""
+        if len(frames) == 1:
+            return complete_frame(self.encode, frames[0], config, measured)
+        return predict_frame(self.encode, frames, config, measured).map
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """The network itself."""
@@ -98,7 +91,10 @@ class DeltasPredictor:
 
 @torch.inference_mode()
 def predict_frame(
-    encode: EncodedFrames, frames: Sequence[Frame], config: PredictConfig
+    encode: EncodedFrames,
+    frames: Sequence[Frame],
+    config: PredictConfig,
+    measured: MeasuredDepth | None = None,
 ) -> FrameDepth:
     """Depth of the first frame from all of them.
 
@@ -106,26 +102,61 @@ def predict_frame(
         encode: of a trained network, on any device.
         frames: the anchor and its sources.
         config: sizes, range, confidence.
+        measured: depth of the anchor that joins the triangulated points.
 
     Raises:
         UserError: an image cannot be read.
     """
     device = next(encode.model.parameters()).device
     anchor = frames[0]
-    most = round(WORK_PIXELS * anchor.extent)
-    work_size = config.work_size or fit_work_size(anchor.image_size, max_pixels=most)
+    work_size = work_size_of(anchor, config)
     images, encoded = encode(frames, work_size=work_size)
     views = anchor_views(frames, work_size=work_size)
     of_one = PosedViews(*(part[None] for part in views.to(device)))
+    known = None if measured is None else known_depth(anchor, measured, work_size).to(device)
     prediction = with_batch_dims(
-        encode.model.from_encoded(encoded, of_one, config.depth_range, image_size=work_size),
+        encode.model.from_encoded(
+            encoded, of_one, config.depth_range, image_size=work_size, known=known
+        ),
         torch.Size(),
     )
-    size = config.size or anchor.image_size
-    depth = resized(prediction.depth, size)
-    confidence = resized(prediction.confidence(), size)
-    kept = confidence >= config.min_confidence
-    points, colors = point_cloud(anchor, depth * kept, size, work_size)
-    return FrameDepth(
-        np.where(kept, depth, 0), confidence, points, colors, prediction, images, views
-    )
+    work = KnownDepth(prediction.depth, prediction.std / prediction.depth)
+    found = finished_map(anchor, work, keypoint_depths(prediction), config)
+    return FrameDepth(found, prediction, images, views)
+
+
+@torch.inference_mode()
+def complete_frame(
+    encode: EncodedFrames, anchor: Frame, config: PredictConfig, measured: MeasuredDepth | None
+) -> DepthMap:
+    """Depth of a frame from what was measured of it, alone.
+
+    Raises:
+        UserError: an image cannot be read, or nothing was measured.
+    """
+    if measured is None or len(measured.depth) == 0:
+        what = f"frame {anchor.id} has no other view and no measured depth"
+        raise UserError(what, anchor.image_path, "use --views 2 or more")
+    device = next(encode.model.parameters()).device
+    work_size = work_size_of(anchor, config)
+    _, encoded = encode([anchor], work_size=work_size)
+    known = known_depth(anchor, measured, work_size).to(device)
+    found = encode.model.complete(encoded, known)
+    work = KnownDepth(found.depth[0], (found.std / found.depth)[0])
+    keypoints = KeypointDepths.of(known.depth[0])
+    return finished_map(anchor, work, keypoints, config)
+
+
+def work_size_of(anchor: Frame, config: PredictConfig) -> tuple[int, int]:
+    """(height, width) that the network sees."""
+    most = round(WORK_PIXELS * anchor.extent)
+    return config.work_size or fit_work_size(anchor.image_size, max_pixels=most)
+
+
+def known_depth(anchor: Frame, measured: MeasuredDepth, work_size: tuple[int, int]) -> KnownDepth:
+    """Measured depth as images ``(1, 1, *work_size)``; where two share a pixel, the nearer."""
+    pixels = torch.from_numpy(measured.pixels)
+    pixels = resize_pixels(pixels, old_size=anchor.image_size, new_size=work_size)
+    depth = torch.from_numpy(measured.depth)
+    drawn = rasterize_depth(pixels, depth, image_size=work_size).depth.float()[None]
+    return KnownDepth(drawn, torch.full_like(drawn, measured.deviation))

@@ -9,6 +9,7 @@ import torch
 from deltas_nets import reference
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
@@ -41,15 +42,22 @@ class Predictor(Protocol):
             UserError: names what it cannot.
         """
 
-    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+    def depth_map(
+        self,
+        frames: Sequence[Frame],
+        config: PredictConfig,
+        measured: MeasuredDepth | None = None,
+    ) -> DepthMap:
         """Depth of the first frame from all of them; frames seen before need not be encoded again.
 
         Args:
             frames: the anchor and its sources.
             config: sizes, range, confidence; asked for what it can do (:meth:`check_asked`).
+            measured: depth of the anchor that is known; without sources the map rests on it alone.
 
         Raises:
-            UserError: an image cannot be read.
+            UserError: an image cannot be read; the network does not take measured depth, or there
+                is neither a source nor such depth.
         """
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:

@@ -17,6 +17,7 @@ from torch import Tensor
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_geom.cameras.poses import relative_pose
 from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import SMALLEST_BASELINE
 from deltas_nets.errors import UserError
@@ -102,8 +103,16 @@ class ReferencePredictor:
         for views in view_sets:
             check_cameras(frames_of(capture, views), work_size=work_size)
 
-    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
-        """Depth of the first frame from all of them."""
+    def depth_map(
+        self,
+        frames: Sequence[Frame],
+        config: PredictConfig,
+        measured: MeasuredDepth | None = None,
+    ) -> DepthMap:
+        """Depth of the first frame from all of them; it takes no measured depth."""
+        if measured is not None or len(frames) == 1:
+            what = "the reference network takes no measured depth, and looks at two views or more"
+            raise UserError(what, "--sensor-depth", "leave it out")
         work_size = config.work_size or WORK_SIZE
         found = predict_reference(self.network, frames, work_size=work_size)
         size = config.size or frames[0].image_size

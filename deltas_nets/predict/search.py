@@ -8,13 +8,15 @@ import numpy as np
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.known_depths import depths_of_sensor, points_in_view
+from deltas_nets.captures.measured import Measured, MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.errors import UserError
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, frames_of
 from deltas_nets.predict.look import found_depths, look
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of, reach_within, wider
 
-__all__ = ["Asked", "Followed", "Found", "Search"]
+__all__ = ["Asked", "Completed", "Followed", "Found", "Search"]
 
 FIRST_BASELINE = 0.2
 """Metres that the network takes the way between two views for, where nothing tells the unit."""
@@ -55,16 +57,24 @@ class Asked:
     Args:
         capture: the frames.
         depth_range: nearest and farthest depth, in the capture's unit.
+        measured: depth that joins the triangulated points, if any.
     """
 
-    def __init__(self, capture: Capture, depth_range: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        depth_range: tuple[float, float],
+        measured: Measured | None = None,
+    ) -> None:
         near, far = depth_range
         unit = 1.0 if capture.metric else (ROOM[0] * ROOM[1] / (near * far)) ** 0.5
         self.capture, self.reach = capture, Reach(near, far, unit)
+        self._measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
-        found = look(predictor, frames_of(self.capture, views), config, self.reach)
+        frames, known = frames_of(self.capture, views), self._measured(views)
+        found = look(predictor, frames, config, self.reach, known)
         return Found(found, self.reach, end_of_pile(found_depths(found), self.reach))
 
 
@@ -75,17 +85,18 @@ class Followed:
 
     Args:
         capture: the frames.
+        measured: depth that joins the triangulated points, if any.
     """
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: Capture, measured: Measured | None = None) -> None:
         self.capture = capture
-        self._position = {id: position for position, id in enumerate(capture.frames)}
+        self._measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
         frames = frames_of(self.capture, views)
         metric = self.capture.metric
-        position = self._position[views.anchor]
+        position, known = self._measured.position[views.anchor], self._measured(views)
         points, ranges = points_in_view(self.capture, position), self.capture.depth_ranges
         if ranges is not None:
             near, far = map(float, ranges[position])
@@ -97,7 +108,7 @@ class Followed:
         else:
             reach, sure = _by_baseline(frames), False
         for _ in range(LOOKS - 1):
-            found = look(predictor, frames, config, reach)
+            found = look(predictor, frames, config, reach, known)
             depths = found_depths(found)
             piled = end_of_pile(depths, reach)
             if sure and piled is None:
@@ -112,8 +123,42 @@ class Followed:
                 reach, sure = reach_of(depths, metric=metric), True
             else:
                 break
-        found = look(predictor, frames, config, reach)
+        found = look(predictor, frames, config, reach, known)
         return Found(found, reach, end_of_pile(found_depths(found), reach))
+
+
+class Completed:
+    """No search: maps of single frames and what was measured of them.
+
+    Args:
+        capture: the frames.
+        measured: their depth.
+    """
+
+    def __init__(self, capture: Capture, measured: Measured) -> None:
+        self.capture = capture
+        self._measured = _Known(capture, measured)
+
+    def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
+        """See `Search`."""
+        known = self._measured(views)
+        if known is None or len(known.depth) == 0:
+            what = f"nothing is measured of frame {views.anchor}"
+            raise UserError(what, self.capture.path, "leave it out, or use --views 2 or more")
+        reach = reach_of(known.depth, metric=self.capture.metric)
+        found = look(predictor, [self.capture.frame(views.anchor)], config, reach, known)
+        return Found(found, reach, None)
+
+
+class _Known:
+    """What is measured of an anchor."""
+
+    def __init__(self, capture: Capture, measured: Measured | None) -> None:
+        self.position = {id: position for position, id in enumerate(capture.frames)}
+        self._measured = measured
+
+    def __call__(self, views: ViewSet) -> MeasuredDepth | None:
+        return None if self._measured is None else self._measured(self.position[views.anchor])
 
 
 def _by_baseline(frames: Sequence[Frame]) -> Reach:

@@ -128,7 +128,7 @@ def test_a_map_does_not_depend_on_what_was_seen_before(model: Deltas, frames: li
     remember = EncodedFrames(model)
     predict_frame(remember, [frames[2], frames[4]], config)
     after = predict_frame(remember, frames[:3], config)
-    assert_close(after.depth, alone.depth, rtol=1e-3, atol=1e-4)
+    assert_close(after.map.depth, alone.map.depth, rtol=1e-3, atol=1e-4)
 
 
 def test_an_image_is_the_files_from_0_to_1(frames: list[Frame]) -> None:

@@ -98,7 +98,7 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(
     handler = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(OutputFolder, "write_frame", killed_at_the_third)
     out = tmp_path / "out"
-    stopped = run("depth", make_capture(), "--out", out, "--views", 2)
+    stopped = run("depth", make_capture(), "--out", out, "--views", 2, "--workers", 1)
     assert (stopped.code, stopped.err) == (130, "deltas: stopped; the same command goes on\n")
     assert json.loads((out / "summary.json").read_text())["status"] == "stopped"
     assert all(len(frame["sources"]) == 1 for frame in frames_of(out).values())

@@ -45,7 +45,9 @@ class Oracle:
         self.wall = wall
         self.asked: list[tuple[float, float]] = []
 
-    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+    def depth_map(
+        self, frames: Sequence[Frame], config: PredictConfig, measured: object = None
+    ) -> DepthMap:
         self.asked.append(config.depth_range)
         baseline = np.linalg.norm((frames[1].cam_from_world - frames[0].cam_from_world)[:3, 3])
         depth = float(np.clip(self.wall * baseline / 0.15, *config.depth_range))
@@ -59,7 +61,9 @@ class Oracle:
 class Blind(Oracle):
     """Finds points and writes no map."""
 
-    def depth_map(self, frames: Sequence[Frame], config: PredictConfig) -> DepthMap:
+    def depth_map(
+        self, frames: Sequence[Frame], config: PredictConfig, measured: object = None
+    ) -> DepthMap:
         found = super().depth_map(frames, config)
         return found._replace(depth=np.zeros_like(found.depth))
 

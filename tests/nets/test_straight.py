@@ -96,7 +96,9 @@ def test_maps_of_straight_images_lie_on_the_photo(name: str, tmp_path: Path) -> 
 class Sees:
     """Depth that follows from the pixel's ray alone: a wall that is slanted."""
 
-    def depth_map(self, frames: list[Frame], config: PredictConfig) -> DepthMap:
+    def depth_map(
+        self, frames: list[Frame], config: PredictConfig, measured: object = None
+    ) -> DepthMap:
         frame = frames[0]
         assert frame.lens is None and config.size is None
         grid = pixel_grid(frame.image_size, dtype=torch.float64)

@@ -1,0 +1,1 @@
+"""Depth maps of one capture made to agree: each says what several say of a place."""

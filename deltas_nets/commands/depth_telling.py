@@ -1,0 +1,63 @@
+"""What `deltas depth` says and shows at its end."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress, warn
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+    from deltas_nets.outputs.folder import OutputFolder
+    from deltas_nets.outputs.products import OutputOptions
+    from deltas_nets.predict.capture import Outcome
+
+
+def tell(outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions", format: str) -> None:
+    """What became of it all, in a few lines."""
+    from deltas_nets.outputs.summary import SUMMARY, read_summary
+
+    kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
+    maps = "1 depth map" if outcome.written == 1 else f"{outcome.written} depth maps"
+    print(f"{maps} in {folder.path}{kept}")
+    if options.unit != "metre":
+        steps = f", {options.depth_scale:g} steps of a PNG in it" if format == "png" else ""
+        print(f"depth is in {options.unit}{steps}; --scale METRES makes it metric")
+    if not options.confidence:
+        print("no confidence is written: the reference network states none")
+    if outcome.blind:
+        warn(f"{outcome.blind} maps without a triangulated point are guesses: see summary.json")
+    if outcome.piled:
+        warn(
+            f"points of {outcome.piled} maps pile up at an end of the depth that was searched: "
+            "is --depth-range too narrow, or a pose wrong? See summary.json"
+        )
+    saturated = sum("saturated_pixels" in record for record in folder.frames.values())
+    if saturated:
+        most = f"{options.max_depth:g} {'m' if options.unit == 'metre' else 'units'}"
+        warn(
+            f"{saturated} maps have depth beyond {most} that is written as {most}: add "
+            f"--depth-scale {options.depth_scale / 10:g} or --format npz; see summary.json"
+        )
+    if outcome.verdict is not None:
+        (warn if outcome.verdict.doubtful else print)(outcome.verdict.line)
+    waiting = (read_summary(folder.path / SUMMARY) or {}).get("waiting_for", ())
+    if waiting:
+        print(f"the folder is complete after --shard {', '.join(waiting)}")
+
+
+def show(capture: "Capture", out: Path, depth_range: tuple[float, float]) -> None:
+    """Write the page; maps are worth more, so what hinders it is only a warning."""
+    from deltas_nets.outputs.summary import SUMMARY, read_summary
+    from deltas_nets.page.maps import open_maps
+    from deltas_nets.page.write import write_page
+
+    if (read_summary(out / SUMMARY) or {}).get("status") != "complete":
+        return  # another shard does it
+    try:
+        maps = open_maps(capture, out)
+        with progress("page", len(maps.ids)) as report:
+            page = write_page(maps, depth_range=depth_range, report=report)
+        print(page.line)
+    except UserError as error:
+        warn(f"no page to look at is written: {error}; deltas page goes on from there")

@@ -1,0 +1,66 @@
+"""Flags of depth that something else than the network measured."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from deltas_nets.errors import UserError
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+    from deltas_nets.captures.measured import Measured
+
+SENSOR, POINTS, HAND = 0.01, 0.02, 0.01
+"""Standard deviations as shares of the depth, where the user states none."""
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """A command to which measured depth can be given."""
+
+    sensor_depth: Annotated[Path | None, tyro.conf.arg(metavar="sensor|points|FILE")] = None
+    """Measured depth joins what is triangulated: the depth images of the capture, its sparse
+    points, or a file of lines ID X Y METRES. With --views 1 maps rest on it alone."""
+    sensor_deviation: Annotated[float | None, tyro.conf.arg(metavar="SHARE")] = None
+    """Its standard deviation as a share of the depth: 0.01 if not given, 0.02 of sparse points."""
+
+    def measured(self, capture: "Capture") -> "Measured | None":
+        """Where measured depth comes from.
+
+        Raises:
+            UserError: the capture has none, or the file is malformed.
+        """
+        from deltas_nets.captures.measured import ByHand, OfPoints, OfSensor, measured_by_hand
+
+        name, deviation = str(self.sensor_depth), self.sensor_deviation
+        if deviation is not None and not 0 < deviation < 1:
+            what = "no standard deviation, as a share of the depth"
+            raise UserError(what, f"--sensor-deviation {deviation:g}", "give a number in 0 to 1")
+        if self.sensor_depth is None:
+            return None
+        if name != "points" and not capture.metric:
+            what = "measured depth is in metres, and the capture is in a unit of its own"
+            raise UserError(what, "--sensor-depth", f"add --scale-from {self.sensor_depth}")
+        if name == "sensor":
+            if all(frame.depth_path is None for frame in capture.frames.values()):
+                what = "the capture has no sensor depth"
+                raise UserError(what, capture.path, "leave out --sensor-depth")
+            return OfSensor(capture, deviation or SENSOR)
+        if name == "points":
+            if capture.points is None:
+                what = "the capture has no sparse points"
+                raise UserError(what, capture.path, "leave out --sensor-depth")
+            return OfPoints(capture, deviation or POINTS)
+        rows = measured_by_hand(self.sensor_depth, capture)
+        return ByHand(capture, rows, deviation or HAND)
+
+    def measured_record(self) -> dict[str, Any]:
+        """What the results depend on, for the record of a run; nothing where nothing is asked."""
+        if self.sensor_depth is None:
+            return {}
+        file = self.sensor_depth if self.sensor_depth.is_file() else None
+        content = {} if file is None else {"lines": file.read_text("utf-8").splitlines()}
+        given = {"from": str(self.sensor_depth), "deviation": self.sensor_deviation}
+        return {"sensor_depth": given | content}

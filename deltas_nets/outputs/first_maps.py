@@ -1,0 +1,69 @@
+"""Maps of the first pass, kept until all are there: a folder of safetensors beside the outputs."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.outputs.atomic_files import plain, write_atomically
+
+__all__ = ["FIRST", "FirstMaps"]
+
+FIRST = "first"
+"""The folder's name."""
+
+
+class FirstMaps:
+    """What the first pass found of each frame, on the disk: a run that was killed goes on.
+
+    Args:
+        out: the folder of outputs.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.folder = out / FIRST
+
+    def file(self, id: str) -> Path:
+        """Where the map of a frame lies."""
+        return self.folder / f"{id}.safetensors"
+
+    def write(self, id: str, found: KnownDepth, record: Mapping[str, Any]) -> None:
+        """Keep a map ``(1, h, w)`` and what the summary will say of it.
+
+        Raises:
+            UserError: the system refuses.
+        """
+        tensors = {"depth": found.depth.float(), "deviation": found.deviation.half()}
+        tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+        content = save(tensors, {"record": json.dumps(plain(record))})
+        file = self.file(id)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, lambda opened: opened.write(content))
+
+    def has(self, id: str) -> bool:
+        """Whether the map of a frame is there."""
+        return self.file(id).exists()
+
+    def read(self, id: str) -> tuple[KnownDepth, dict[str, Any]] | None:
+        """The map of a frame and its record; None where it is not there, or damaged."""
+        try:
+            with safe_open(self.file(id), framework="pt") as opened:
+                tensors = [opened.get_tensor(name).float() for name in ("depth", "deviation")]
+                record: dict[str, Any] = json.loads(opened.metadata()["record"])
+        except (OSError, SafetensorError, KeyError, ValueError, TypeError):
+            return None
+        depth, deviation = tensors
+        usable = (depth > 0) & (depth < torch.inf) & (deviation > 0) & (deviation < torch.inf)
+        return KnownDepth(torch.where(usable, depth, 0.0), deviation), record
+
+    def remove(self) -> None:
+        """Remove them; the outputs are there."""
+        for file in sorted(self.folder.rglob("*"), reverse=True):
+            file.unlink() if file.is_file() else file.rmdir()
+        if self.folder.is_dir():
+            self.folder.rmdir()
