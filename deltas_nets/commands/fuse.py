@@ -109,6 +109,7 @@ class Fuse(Command):
         if len(source.ids) == 1 and config.neighbours:
             warn("there is one map, and none to compare it with")
             config = sensible(FuseConfig, voxel=self.voxel, neighbours=0)
+        device = usable_device(self.device)
         with progress("fuse", len(source.ids)) as report:
             fused = fuse_capture(
                 source,
@@ -116,7 +117,8 @@ class Fuse(Command):
                 config,
                 self.products(),
                 gigabytes=self.memory,
-                device=usable_device(self.device),
+                # Sums need float64 poses, which CUDA has and others lack.
+                device=device if device.startswith("cuda") else "cpu",
                 overwrite=self.overwrite,
                 report=report,
             )
@@ -132,3 +134,25 @@ class Fuse(Command):
         counts = ", ".join(f"{count} {what}" for what, count in fused.counts.items())
         print(f"{names}: {counts or 'kept from an earlier run'}")
         print(f"{fused.frames} maps, voxels of {fused.voxel:g}")
+
+
+def fuse_maps(
+    capture: "Capture", folder: Path, *, cloud: bool, mesh: bool, device: str, overwrite: bool
+) -> None:
+    """What `deltas depth` does at its end: fuse the maps of its folder, if all are there.
+
+    Where other shards are still at work the last of them does it.
+    """
+    from deltas_nets.outputs.summary import SUMMARY, read_summary
+
+    summary = read_summary(folder / SUMMARY)
+    if summary is not None and summary["status"] == "complete":
+        fuse = Fuse(
+            capture=capture.path,
+            depths=folder,
+            cloud=cloud,
+            mesh=mesh,
+            device=device,
+            overwrite=overwrite,
+        )
+        fuse.fuse(capture, folder)

@@ -70,7 +70,10 @@ def joined(parts: Sequence[Mesh], seams: Sequence[NDArray[np.int64]]) -> Mesh:
 
 
 def without_small_parts(mesh: Mesh, least_area: float) -> Mesh:
-    """The mesh less parts that hang together with no other and have less than some area."""
+    """The mesh less parts that hang together with no other and have less than some area.
+
+    Parts of a twentieth of the largest one or more stay: a mesh of coarse voxels is no speck.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -83,4 +86,4 @@ def without_small_parts(mesh: Mesh, least_area: float) -> Mesh:
     _, part = connected_components(graph, directed=False)
     part_of_face = part[mesh.faces[:, 0]]
     areas = np.bincount(part_of_face, weights=mesh.areas())
-    return mesh.with_faces(areas[part_of_face] >= least_area)
+    return mesh.with_faces(areas[part_of_face] >= min(least_area, areas.max() / 20))

@@ -1,0 +1,202 @@
+"""`deltas fuse`: what it writes, how it goes on, what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import MakeCapture
+from fused_scenes import write_maps
+from PIL import Image
+from run_command import Run, assert_one_line
+from small_capture import write_capture
+
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.fuse import FuseConfig
+from deltas_nets.fuse.fusing import SUMMARY, fuse_capture
+from deltas_nets.fuse.sources import depth_source
+from deltas_nets.fuse.state import STATE
+
+FEW = ("--neighbours", "2")
+
+
+@pytest.fixture
+def maps(make_capture: MakeCapture, tmp_path: Path) -> tuple[Path, Path]:
+    """A capture, and the folder of its maps."""
+    path = make_capture()
+    write_maps(tmp_path / "maps", path)
+    return path, tmp_path / "maps"
+
+
+def vertices_of(path: Path) -> np.ndarray:
+    """As many numbers as the header says, float, with three bytes of colour."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    count = int(header.split(b"element vertex ")[1].split()[0])
+    normals = 3 if b"nx" in header else 0
+    kind = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", normals), ("rgb", "u1", 3)])
+    return np.frombuffer(body, kind, count)["xyz"]
+
+
+def test_maps_become_a_cloud_and_a_mesh(maps: tuple[Path, Path], tmp_path: Path, run: Run) -> None:
+    result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05)
+    assert result.code == 0, result.err
+    summary = json.loads((tmp_path / "out" / SUMMARY).read_text())
+    assert summary["status"] == "complete"
+    assert not (tmp_path / "out" / STATE).exists()
+    for name, count in (("cloud", "points"), ("mesh", "vertices")):
+        points = vertices_of(tmp_path / "out" / f"{name}.ply")
+        assert len(points) == summary[count] > 100
+        assert abs(points[:, 2] - 2.5).max() < 1e-3
+    again = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05)
+    assert "kept from an earlier run" in again.out
+
+
+def test_sensor_depth_has_no_need_of_maps(
+    make_capture: MakeCapture, tmp_path: Path, run: Run
+) -> None:
+    result = run("fuse", make_capture(), "sensor", "--out", tmp_path / "out", "--cloud")
+    assert result.code == 0, result.err
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["cloud.ply", SUMMARY]
+    assert abs(vertices_of(tmp_path / "out" / "cloud.ply")[:, 2] - 2.5).max() < 1e-3
+
+
+def test_a_depth_camera_aside_is_put_where_it_stands(make_capture: MakeCapture) -> None:
+    capture = open_capture(make_capture(depth_size=(24, 32)))
+    view = depth_source(capture, Path("sensor")).view("1")
+    assert view.image_size == (24, 32)
+    points = view.points().reshape(-1, 3).double() @ view.world_from_cam[:3, :3].T
+    assert abs(points[:, 2] - 2.5).max() < 1e-5
+    assert view.colors.float().std() > 10
+
+
+def test_a_stopped_run_goes_on_and_ends_the_same(maps: tuple[Path, Path], tmp_path: Path) -> None:
+    capture, folder = maps
+    source = depth_source(open_capture(capture), folder)
+    config = FuseConfig(voxel=0.05, neighbours=2)
+    fuse_capture(source, tmp_path / "whole", config)
+    added: list[str] = []
+
+    def stop(id: str) -> None:
+        added.append(id)
+        if len(added) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fuse_capture(source, tmp_path / "stopped", config, report=stop)
+    assert (tmp_path / "stopped" / STATE).exists()
+    fuse_capture(source, tmp_path / "stopped", config, report=added.append)
+    assert added == [*source.ids[:2], *source.ids]
+    for name in ("cloud.ply", "mesh.ply"):
+        whole, stopped = (vertices_of(tmp_path / out / name) for out in ("whole", "stopped"))
+        np.testing.assert_allclose(stopped, whole, atol=1e-5)
+
+
+def test_a_state_that_is_cut_is_begun_anew(maps: tuple[Path, Path], tmp_path: Path) -> None:
+    source = depth_source(open_capture(maps[0]), maps[1])
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / STATE).write_bytes(b"\x10")
+    fused = fuse_capture(source, tmp_path / "out", FuseConfig(voxel=0.05, neighbours=2))
+    assert fused.counts["points"] > 100
+
+
+def test_maps_of_another_capture_are_refused(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    other = write_capture(tmp_path / "other", 4, step=0.2)
+    assert_one_line(
+        run("fuse", other, maps[1], "--out", tmp_path / "out"), "other cameras", "other"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_maps_is_refused(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    assert_one_line(run("fuse", maps[0], tmp_path, "--out", tmp_path / "out"), "no depth maps")
+
+
+@pytest.mark.parametrize("kind", ["depth", "confidence"])
+def test_a_corrupt_map_is_named_before_anything_is_written(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run, kind: str
+) -> None:
+    file = maps[1] / kind / "2.png"
+    file.write_bytes(file.read_bytes()[:-30])
+    assert_one_line(run("fuse", *maps, "--out", tmp_path / "out"), f"{kind}/2.png", "no whole PNG")
+    assert not (tmp_path / "out").exists()
+
+
+def test_voxels_too_fine_are_refused_with_those_that_fit(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 1e-6)
+    assert_one_line(result, "voxels of 1e-06", "GB", "use 0.00")
+    assert not (tmp_path / "out").exists()
+
+
+def test_maps_that_contradict_leave_nothing_and_say_so(
+    make_capture: MakeCapture, tmp_path: Path, run: Run
+) -> None:
+    path = make_capture()
+    write_maps(tmp_path / "maps", path)
+    for id in range(4):
+        depth = np.full((48, 64), 1000 * (id + 1), dtype=np.uint16)
+        Image.fromarray(depth).save(tmp_path / "maps" / "depth" / f"{id}.png")
+    arguments = ("fuse", path, tmp_path / "maps", "--out", tmp_path / "out")
+    assert_one_line(run(*arguments), "no depth is left", "--no-consistency")
+    assert run(*arguments, "--no-consistency").code == 2  # other settings
+    assert run(*arguments, "--no-consistency", "--overwrite").code == 0
+
+
+def test_one_map_alone_is_fused_with_a_warning(
+    make_capture: MakeCapture, tmp_path: Path, run: Run
+) -> None:
+    path = make_capture()
+    write_maps(tmp_path / "maps", path)
+    for id in (0, 1, 3):
+        (tmp_path / "maps" / "depth" / f"{id}.png").unlink()
+    result = run("fuse", path, tmp_path / "maps", "--out", tmp_path / "out")
+    assert result.code == 0, result.err
+    assert len(result.warnings) == 2
+    assert "none to compare" in result.warnings[1]
+
+
+def test_holes_in_maps_are_holes(maps: tuple[Path, Path], tmp_path: Path, run: Run) -> None:
+    for file in (maps[1] / "depth").iterdir():
+        depth = np.array(Image.open(file))
+        depth[:, 20:40] = 0
+        Image.fromarray(depth).save(file)
+    run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05, *FEW)
+    assert len(vertices_of(tmp_path / "out" / "mesh.ply")) > 50
+
+
+def test_doubtful_pixels_are_left_out(make_capture: MakeCapture, tmp_path: Path, run: Run) -> None:
+    path = make_capture()
+    write_maps(tmp_path / "maps", path, confidence=0.2)
+    arguments = ("fuse", path, tmp_path / "maps", "--out", tmp_path / "out")
+    assert_one_line(run(*arguments), "sure enough", "--min-confidence")
+    assert run(*arguments, "--min-confidence", 0.1).code == 0
+
+
+def test_a_file_of_somebody_else_is_not_replaced(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    (tmp_path / "mesh.ply").write_text("mine")
+    assert_one_line(run("fuse", *maps, "--out", tmp_path), "mesh.ply", "--overwrite")
+    assert (tmp_path / "mesh.ply").read_text() == "mine"
+
+
+def test_glb_needs_its_extra(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deltas_nets.fuse.files.find_spec", lambda _: None)
+    result = run("fuse", *maps, "--out", tmp_path / "out", "--glb")
+    assert_one_line(result, "trimesh", "deltas-depth[mesh]")
+    assert not (tmp_path / "out").exists()
+
+
+def test_torch_has_its_threads_back(maps: tuple[Path, Path], tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    source = depth_source(open_capture(maps[0]), maps[1])
+    fuse_capture(source, tmp_path / "out", FuseConfig(voxel=0.1, neighbours=2))
+    assert torch.get_num_threads() == before
