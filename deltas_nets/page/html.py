@@ -28,7 +28,7 @@ KINDS = {
     "truth": "Sensor depth",
 }
 """Pictures, in the order of the page."""
-HALVES = 65535
+STEPS = 65535
 """Steps of a coordinate within the box of its layer."""
 
 
@@ -206,12 +206,7 @@ def _frame(maps: Maps, frame: ShownFrame) -> dict[str, Any]:
     if record.get("status") not in (None, "ok", "kept"):
         facts["Status"] = str(record["status"])
     pictures = {kind: _base64(file) for kind, file in frame.jpegs.items()}
-    return {
-        "id": frame.id,
-        "facts": facts,
-        "confidence": known.get("confidence"),
-        "pictures": pictures,
-    }
+    return {"id": frame.id, "facts": facts, "pictures": pictures}
 
 
 def _scene(maps: Maps, frames: Sequence[ShownFrame], layers: Sequence[Layer]) -> dict[str, Any]:
@@ -239,7 +234,7 @@ def _layer(layer: Layer, centre: NDArray[np.float64]) -> dict[str, Any]:
         "low": _rounded(low),
         "span": _rounded(span),
         "box": [_rounded(middle[0]), _rounded(middle[1])],
-        "xyz": _base64(np.rint(HALVES * (xyz - low) / span).astype("<u2")),
+        "xyz": _base64(np.rint(STEPS * (xyz - low) / span).astype("<u2")),
         "rgb": _base64(layer.surface.rgb),
         "faces": None if faces is None else _base64(faces.astype("<u4")),
     }

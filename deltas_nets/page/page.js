@@ -124,6 +124,10 @@ at("wipe").onpointermove = (event) => {
 };
 at("wipe").onpointerleave = () => { at("reading").textContent = ""; };
 
+// A tall picture is narrower, so that all of it fits the screen.
+at("under").onload = ({ target }) => {
+  at("wipe").style.maxWidth = `${85 * target.naturalWidth / target.naturalHeight}vh`;
+};
 for (const side of ["left", "right"]) {
   for (const kind of kinds) at(side).append(element("option", data.kinds[kind], { value: kind }));
   at(side).onchange = () => { state[side] = at(side).value; show(); };

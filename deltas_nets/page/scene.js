@@ -130,7 +130,8 @@ function sceneIn(canvas, { up, layers, cameras }, onCamera) {
 
   function reset() {
     const target = low.map((x, axis) => (x + high[axis]) / 2);
-    Object.assign(view, { yaw: 0.35, pitch: 0.5, distance: 1.6 * radius, target, slope: 0.5 });
+    const tall = Math.max(1, canvas.clientHeight / canvas.clientWidth);
+    Object.assign(view, { yaw: 0.35, pitch: 0.5, distance: 1.6 * radius * tall, target, slope: 0.5 });
     changed();
   }
 

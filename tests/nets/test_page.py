@@ -290,12 +290,11 @@ def test_one_frame_and_a_map_without_depth(make_capture: MakeCapture, tmp_path: 
 def test_ids_are_not_taken_for_the_pages_own_words(
     make_capture: MakeCapture, tmp_path: Path
 ) -> None:
-    folder = write_maps(make_capture(), tmp_path / "maps")
-    maps = open_maps(open_capture(make_capture(path=tmp_path / "again")), folder)
-    text = json.dumps({ODD: json.loads((folder / "summary.json").read_text())})
-    assert ODD in json.loads(text)
-    frames = [write.shown_frame(write.pictures_of(maps, "0", maps.depth("0"), ERROR, (0.5, 10)))]
-    page = write.html_of(maps, [frames[0]._replace(id=ODD)], [], ERROR, (0.5, 10))
+    capture = make_capture()
+    folder = write_maps(capture, tmp_path / "maps")
+    maps = open_maps(open_capture(capture), folder)
+    frame = write.shown_frame(write.pictures_of(maps, "0", maps.depth("0"), ERROR, (0.5, 10)))
+    page = write.html_of(maps, [frame._replace(id=ODD)], [], ERROR, (0.5, 10))
     (folder / "index.html").write_bytes(page)
     assert data_of(folder)["frames"][0]["id"] == ODD
 
