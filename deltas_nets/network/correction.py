@@ -117,9 +117,9 @@ def correction(
     depth = torch.where(used, known.depth.flatten(1).gather(-1, index), 1.0)
     off = torch.where(used, depth.log() - log_depth.flatten(1).gather(-1, index), 0.0)
     own = variance.flatten(1).gather(-1, index) + ROUGHNESS**2
-    # A place without a depth is one that nothing is known of.
-    noise = torch.where(used, own, 1e4)
-    among = covariance(places, places)
+    # A place without a depth shares nothing with the others.
+    noise = torch.where(used, own, 1.0)
+    among = covariance(places, places) * (used[:, None, :] & used[:, :, None])
     doubt = torch.ones_like(noise)
     for _ in range(ROUNDS):
         inverse = torch.linalg.inv(among + torch.diag_embed(noise * doubt))

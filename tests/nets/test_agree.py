@@ -1,0 +1,126 @@
+"""Maps that agree: what one sees from another's place, what most say, who hears whom."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from deltas_geom import PosedViews
+from deltas_nets.agree.agreed import agreed
+from deltas_nets.agree.consensus import LEAST, TOLERANCE, consensus
+from deltas_nets.agree.neighbours import neighbours, sample
+from deltas_nets.agree.seen_from import seen_from
+from deltas_nets.network.known_depth import KnownDepth
+
+SIZE = (24, 32)
+K = torch.tensor([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]], dtype=torch.float64)
+seeds = st.integers(0, 1000)
+
+
+def camera(x: float, z: float = 0.0, turn: float = 0.0) -> PosedViews:
+    """A camera at (x, 0, z) that is turned about y."""
+    cam_from_world = torch.eye(4, dtype=torch.float64)
+    cos, sin = math.cos(turn), math.sin(turn)
+    cam_from_world[:3, :3] = torch.tensor([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])
+    cam_from_world[:3, 3] = -cam_from_world[:3, :3] @ torch.tensor([x, 0, z], dtype=torch.float64)
+    return PosedViews(K[None], cam_from_world[None])
+
+
+def wall(view: PosedViews, distance: float = 3.0) -> Tensor:
+    """Depth ``(1, 1, H, W)`` of the plane z = distance."""
+    rows, columns = torch.meshgrid(*map(torch.arange, SIZE), indexing="ij")
+    rays = torch.stack([columns, rows, torch.ones(SIZE)], dim=-1).double() @ torch.inverse(K).mT
+    in_world = rays @ view.cam_from_world[0, :3, :3]
+    centre = -view.cam_from_world[0, :3, :3].mT @ view.cam_from_world[0, :3, 3]
+    return ((distance - centre[2]) / in_world[..., 2])[None, None]
+
+
+def sure(depth: Tensor, deviation: float = 0.02) -> KnownDepth:
+    return KnownDepth(depth, torch.full_like(depth, deviation))
+
+
+@given(st.floats(-0.4, 0.4), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1))
+def test_a_wall_is_the_same_wall_from_elsewhere(x: float, z: float, turn: float) -> None:
+    other, anchor = camera(x, z, turn), camera(0)
+    seen = seen_from(sure(wall(other), 0.07), other, anchor, image_size=SIZE)
+    known = seen.depth > 0
+    assert known.double().mean() > 0.4
+    # Points fall beside the centres of pixels; of a wall that is seen at a slant that is a step.
+    assert_close(seen.depth[known], wall(anchor)[known], rtol=5e-3, atol=0)
+    assert_close(seen.deviation[known], torch.full_like(seen.deviation[known], 0.07))
+
+
+def test_the_nearer_of_two_hides_the_other() -> None:
+    depth = wall(camera(0.3))
+    depth[..., 12:, :] = 1.0
+    seen = seen_from(sure(depth), camera(0.3), camera(0), image_size=SIZE).depth[0, 0]
+    assert ((seen - 1).abs() < 1e-9).any() and ((seen - 3).abs() < 1e-9).any()
+    assert (((seen - 1).abs() < 1e-9) | ((seen - 3).abs() < 1e-9) | (seen == 0)).all()
+
+
+@given(seeds, st.integers(LEAST, 6))
+def test_what_most_say_does_not_depend_on_their_order(seed: int, count: int) -> None:
+    random = torch.Generator().manual_seed(seed)
+    depth = (0.05 * torch.randn(count, 1, 5, 6, generator=random, dtype=torch.float64)).exp()
+    maps = KnownDepth(depth, 0.02 + 0.1 * torch.rand(depth.shape, generator=random).double())
+    found = consensus(maps)
+    order = torch.randperm(count, generator=random)
+    other = consensus(KnownDepth(*(part[order] for part in maps)))
+    assert_close(found.depth, other.depth)
+    assert_close(found.deviation, other.deviation)
+
+
+@given(seeds, st.floats(0.5, 2).filter(lambda s: abs(math.log(s)) > 3 * TOLERANCE))
+def test_three_that_agree_outvote_one_and_two_do_not(seed: int, scale: float) -> None:
+    random = torch.Generator().manual_seed(seed)
+    depth = 2 + torch.rand(1, 1, 4, 5, generator=random, dtype=torch.float64)
+    three = torch.cat([depth, depth, depth, depth * scale])
+    found = consensus(sure(three))
+    assert_close(found.depth, depth[0])
+    assert_close(found.deviation, torch.full_like(depth[0], 0.02))
+    assert not consensus(sure(three[1:])).depth.any()
+
+
+def test_a_map_takes_what_three_others_say_and_moves_the_rest_as_they_would() -> None:
+    truth = wall(camera(0))
+    own = sure(truth[0] * 1.2, 0.1)
+    others = truth.repeat(3, 1, 1, 1)
+    others[..., 20:] = 0  # nobody sees the right side
+    found = agreed(own, sure(others))
+    assert_close(found.depth[..., :20], truth[0, ..., :20])
+    left = (found.depth[0, :, 20:] / truth[0, 0, :, 20:] - 1).mean(dim=0)
+    assert (left.diff() > 0).all() and 0 < left[0] < 0.06 and left[-1] < 0.15
+    assert_close(found.deviation[..., 20:], own.deviation[..., 20:])
+
+
+def test_a_map_that_nobody_sees_stays() -> None:
+    own = sure(wall(camera(0))[0])
+    nothing = KnownDepth(torch.zeros(2, 1, *SIZE).double(), torch.zeros(2, 1, *SIZE).double())
+    assert agreed(own, nothing) is own
+
+
+def test_neighbours_are_those_that_share_most() -> None:
+    places = [0.0, 0.4, 1.1, 1.5, 40.0]
+    views = [camera(x) for x in places]
+    points = torch.stack([sample(wall(view)[0], view) for view in views])
+    cameras = PosedViews(*(torch.cat(parts) for parts in zip(*views, strict=True)))
+    found = neighbours(points, cameras, [SIZE] * 5)
+    assert found[4] == []
+    for own, near in enumerate(found[:4]):
+        apart = [abs(places[other] - places[own]) for other in near]
+        # A sample is 0.35 m wide.
+        assert all(far > close - 0.36 for close, far in pairwise(apart))
+        assert own not in near and 4 not in near
+        assert all(own in found[other] for other in near)
+
+
+@pytest.mark.parametrize("size", [(24, 32), (40, 91)])
+def test_samples_lie_on_what_the_map_shows(size: tuple[int, int]) -> None:
+    points = sample(torch.full((1, *size), 2.0), camera(0.7, 0.4))
+    assert points.shape == (64, 3) and len(points.unique(dim=0)) == 64
+    assert_close(points[:, 2], torch.full((64,), 2.4).double())
