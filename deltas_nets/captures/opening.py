@@ -11,6 +11,7 @@ from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.inside import several_captures
 from deltas_nets.captures.readers import (
     colmap,
     demon,
@@ -29,6 +30,7 @@ from deltas_nets.captures.readers import (
     transforms,
     tum,
 )
+from deltas_nets.captures.readers.colmap_folder import PLACES
 from deltas_nets.captures.readers.refused import refusal
 from deltas_nets.errors import UserError
 
@@ -81,6 +83,9 @@ READERS: tuple[Reader, ...] = (
 )
 """The first that recognises a folder reads it."""
 
+_LOOKING_INSIDE: tuple[Reader, ...] = (colmap, scannet, openmvg, strecha)
+"""Those that recognise folders by what is in folders of theirs, which may be several captures."""
+
 
 _LAYOUTS = (
     "a capture is a COLMAP model, a transforms.json, a frames.json, ScanNet's export or one of "
@@ -108,6 +113,10 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
         raise UserError("the capture is not a folder", path, _LAYOUTS)
     try:
         reader = next((reader for reader in READERS if reader.recognises(path)), None)
+        if path.is_dir() and (reader is None or _found_inside(reader, path)):
+            several = several_captures(path, READERS, reader)
+            if several is not None:
+                raise several
         if reader is None:
             what = "there is no capture in the folder" if path.is_dir() else "this is no capture"
             raise refusal(path) or UserError(what, path, _LAYOUTS)
@@ -117,6 +126,12 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
     except OSError as error:
         what = f"the capture cannot be read ({error.strerror or error})"
         raise UserError(what, Path(error.filename or path), "check its permissions") from error
+
+
+def _found_inside(reader: Reader, path: Path) -> bool:
+    """Whether a reader may have recognised a folder by a folder in it alone."""
+    itself = scannet.is_scene(path) or any((path / place).is_dir() for place in PLACES)
+    return reader in _LOOKING_INSIDE and not itself
 
 
 def _read(reader: Reader, path: Path, intrinsics: Intrinsics | None) -> Capture:
@@ -151,14 +166,12 @@ def _usable(capture: Capture) -> Capture:
     if not capture.frames and not capture.lost:
         raise UserError("the capture has no frame", capture.path, "add images and their poses")
     if not capture.frames:
-        without_image = [lost for lost in capture.lost.values() if lost.reason == "no image"]
+        without_image = {id: lost for id, lost in capture.lost.items() if lost.reason == "no image"}
         if without_image:
-            error = without_image[0].error
-            raise UserError(
-                f"no frame has a pose and an image ({len(without_image)} images are missing)",
-                error.where,
-                error.remedy,
-            )
+            error = next(iter(without_image.values())).error
+            names = ids_in_words(without_image)
+            what = f"no frame has a pose and an image; missing are those of {names}"
+            raise UserError(what, error.where, error.remedy)
         what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(capture.lost)})"
         where = [Path(lost.error.where).parent for lost in capture.lost.values()]
         raise UserError(what, next(iter(where), capture.path), "run the tracking again")

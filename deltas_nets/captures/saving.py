@@ -8,13 +8,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.new_folder import check_new
 from deltas_nets.captures.writers import colmap, own, scannet, transforms
-from deltas_nets.captures.writers.files import Placing
+from deltas_nets.captures.writers.files import Placing, Putting
 from deltas_nets.errors import UserError
 
-__all__ = ["WRITERS", "Writer", "check_new", "save_capture"]
+__all__ = ["WRITERS", "Writer", "save_capture"]
 
-Writer = Callable[[Capture, Path, Placing], list[str]]
+Writer = Callable[[Capture, Path, Putting], list[str]]
 
 WRITERS: Mapping[str, Writer] = {
     "own": own.write,
@@ -26,19 +27,13 @@ WRITERS: Mapping[str, Writer] = {
 """By the name of the format; see `deltas_nets.captures.writers` for what they do."""
 
 
-def check_new(out: Path) -> None:
-    """Whether a folder is there for a capture to be written to.
-
-    Raises:
-        UserError: it holds something, or is a file.
-    """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        what = "the folder is not empty" if out.is_dir() else "this is a file, not a folder"
-        raise UserError(what, out, "name a new folder")
-
-
 def save_capture(
-    capture: Capture, out: str | Path, to: str = "own", *, placing: Placing = "copy"
+    capture: Capture,
+    out: str | Path,
+    to: str = "own",
+    *,
+    placing: Placing = "copy",
+    report: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
     """Write a capture in another format.
 
@@ -49,6 +44,7 @@ def save_capture(
         out: a folder that does not exist, or is empty.
         to: one of `WRITERS`.
         placing: whether images and depth are copied, or are links to where they are.
+        report: called with the id of every frame that is written.
 
     Returns:
         What the format had no place for, in words.
@@ -68,7 +64,7 @@ def save_capture(
     temporary = beside.with_name(f".{beside.name}.{secrets.token_hex(4)}.deltas-tmp")
     try:
         temporary.mkdir(parents=True)
-        said = WRITERS[to](capture, temporary, placing)
+        said = WRITERS[to](capture, temporary, Putting(placing, report))
         if out.exists():
             out.rmdir()  # an empty one: not every system renames to what is there
         os.replace(temporary, beside)

@@ -48,11 +48,16 @@ class Check(Command):
 
     def run(self) -> None:
         """Run the command."""
+        from deltas_nets.captures.new_folder import check_new
+
+        if self.mend is not None:
+            check_new(self.mend)
+
         import torch
 
         from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.saving import check_new, save_capture
+        from deltas_nets.captures.saving import save_capture
         from deltas_nets.check.matched import GROUPS
         from deltas_nets.check.refused import refused
         from deltas_nets.check.verdict import Checked, check_capture
@@ -65,8 +70,6 @@ class Check(Command):
 
         if self.json is not None:
             check_writable(self.json.parent)
-        if self.mend is not None:
-            check_new(self.mend)
         device = usable_device(self.device)
         # Frames are small: threads that share one wait for each other, those with their own do not.
         threads = min(MOST_THREADS, torch.get_num_threads())

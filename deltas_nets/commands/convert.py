@@ -2,12 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
+from deltas_nets.errors import UserError
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,9 @@ class Convert(Command):
     """Copy images and depth, or link to where they are."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Length of the capture's unit, if you know it: what is written is in metres then."""
+    scale_from: Annotated[Path | None, tyro.conf.arg(metavar="sensor|FILE")] = None
+    """Find that length by its sensor depth, which is in metres, or by a file of measured depths:
+    lines ID X Y METRES."""
     intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
     """Of all images, in quotes: fx fy cx cy and, of a lens, k1 k2 p1 p2 k3; or freiburg1."""
     debug: Flag = False
@@ -40,20 +47,49 @@ class Convert(Command):
 
     def run(self) -> None:
         """Run the command."""
+        from deltas_nets.captures.new_folder import check_new
+
+        check_new(self.out)
+        if self.scale is not None and self.scale_from is not None:
+            raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
+
         from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.ids import ids_in_words
-        from deltas_nets.captures.in_metres import in_metres
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import save_capture
-        from deltas_nets.terminal import warn
+        from deltas_nets.terminal import progress, warn
 
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = open_capture(self.capture, intrinsics=stated)
-        if self.scale is not None:
-            capture = in_metres(capture, self.scale)
-        left_out = save_capture(capture, self.out, self.to, placing=self.images)
+        capture = self._in_metres(open_capture(self.capture, intrinsics=stated))
+        with progress("writing", len(capture.frames)) as report:
+            left_out = save_capture(capture, self.out, self.to, placing=self.images, report=report)
         for doubt in (*capture.doubts, *left_out):
             warn(doubt)
         if capture.lost:
             warn(f"frames that cannot be used are left out: {ids_in_words(capture.lost)}")
-        print(f"{len(capture.frames)} frames of {capture.layout or 'the capture'} in {self.out}")
+        frames = "1 frame" if len(capture.frames) == 1 else f"{len(capture.frames)} frames"
+        read_as = f", read as {capture.layout}," if capture.layout else ""
+        print(f"{frames}{read_as} written to {self.out} as {self.to}")
+
+    def _in_metres(self, capture: "Capture") -> "Capture":
+        """The capture in metres if a flag says how, else as it is."""
+        from deltas_nets.captures.in_metres import in_metres
+        from deltas_nets.captures.scaled import scaled
+
+        if self.scale is not None:
+            return in_metres(capture, self.scale)
+        if self.scale_from is None:
+            return capture
+        from deltas_nets.predict.depth_map import PredictConfig
+        from deltas_nets.predict.first_look import scale_by_measurements, scale_by_sensor
+        from deltas_nets.predict.predictor import load_predictor
+
+        predictor, config = load_predictor("deltas-small"), PredictConfig()
+        if str(self.scale_from) == "sensor":
+            unit = scale_by_sensor(predictor, capture, config)
+            moved = scaled(capture, unit)  # depth files are in metres already
+        else:
+            unit = scale_by_measurements(predictor, capture, config, self.scale_from)
+            moved = in_metres(capture, unit)
+        print(f"a unit of the capture is {unit:.4g} m")
+        return moved

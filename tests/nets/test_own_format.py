@@ -146,7 +146,10 @@ def test_depth_points_and_who_sees_them(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("key", "meant"),
-    [("worldfromcam", "world_from_cam"), ("Image", "image"), ("depht", "depth"), ("lense", "lens")],
+    [
+        *[("worldfromcam", "world_from_cam"), ("Image", "image"), ("depht", "depth")],
+        *[("lense", "lens"), ("file", "image"), ("K", "fx, fy, cx, cy"), ("w2c", "cam_from_world")],
+    ],
 )
 def test_an_unknown_key_is_named_with_the_one_that_was_meant(
     tmp_path: Path, key: str, meant: str
@@ -154,6 +157,14 @@ def test_an_unknown_key_is_named_with_the_one_that_was_meant(
     with pytest.raises(UserError) as error:
         open_capture(write(tmp_path, changed(**{key: 1})))
     assert key in error.value.what and error.value.remedy == f"did you mean {meant}?"
+
+
+def test_a_unit_of_known_length_is_read_as_metres_or_refused_by_name(tmp_path: Path) -> None:
+    assert all(open_capture(write(tmp_path, units=u)).metric for u in ("m", "Meters", "metre"))
+    for units, factor in {"mm": "0.001", "Centimeters": "0.01", "inches": "0.0254"}.items():
+        with pytest.raises(UserError) as error:
+            open_capture(write(tmp_path, units=units))
+        assert units in error.value.what and f"--scale {factor}" in error.value.remedy
 
 
 @pytest.mark.parametrize("reason", ["no pose", "no image"])

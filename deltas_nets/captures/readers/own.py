@@ -32,12 +32,12 @@ from deltas_nets.captures.readers.own_table import (
     check_keys,
     read_csv,
 )
+from deltas_nets.captures.readers.units import is_metric
 from deltas_nets.errors import UserError
 
 __all__ = ["NAMES", "read", "recognises"]
 
 NAMES = ("frames.json", "frames.csv")
-METRES = ("metres", "meters", "m")
 
 
 class _Entry(NamedTuple):
@@ -84,7 +84,7 @@ def read(path: Path) -> Capture:
         lost=lost,
         doubts=tuple(doubts_of_sizes(cameras.values())),
         layout=file.name,
-        metric=root.text("units") in METRES,
+        metric=is_metric(root),
         points=read_points(root, file.parent, ids, packed, scales),
         sources=_sources(used, list(packed), ids),
         depth_ranges=_depth_ranges(root, used),
@@ -151,9 +151,7 @@ def _root(file: Path) -> Fields:
         what = f"the file is of version {version:g}, this program reads {VERSION}"
         raise UserError(what, file, "install a newer deltas-depth" if version > VERSION else REMEDY)
     check_keys(root, ROOT)
-    if "units" not in root:
-        remedy = 'say "units": "metres", or "unknown" where the scale is not known'
-        raise UserError("the file does not state its units", file, remedy)
+    is_metric(root)
     if not root.items("frames"):
         raise root.error("has no frames")
     return root

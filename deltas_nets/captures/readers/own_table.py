@@ -13,7 +13,16 @@ from pathlib import Path
 from deltas_nets.captures.readers.json_file import Fields
 from deltas_nets.errors import UserError
 
-__all__ = ["CAMERA", "DEPTH_CAMERA", "FRAME", "REMEDY", "ROOT", "VERSION", "check_keys", "read_csv"]
+__all__ = [
+    "CAMERA",
+    "DEPTH_CAMERA",
+    "FRAME",
+    "REMEDY",
+    "ROOT",
+    "VERSION",
+    "check_keys",
+    "read_csv",
+]
 
 VERSION = 1
 REMEDY = "see docs/captures.md for what it may hold"
@@ -30,6 +39,36 @@ ROOT = (
     *("version", "units", "pixel_centres", *CAMERA, "cameras", "frames"),
     *("depth_scale", "depth_camera", "depth_range", "points", "observations"),
 )
+MEANT = {
+    "k": "fx, fy, cx, cy",
+    "intrinsics": "fx, fy, cx, cy",
+    "intrinsic": "fx, fy, cx, cy",
+    "camera_matrix": "fx, fy, cx, cy",
+    "camera_intrinsics": "fx, fy, cx, cy",
+    "file": "image",
+    "filename": "image",
+    "file_name": "image",
+    "file_path": "image",
+    "path": "image",
+    "name": "image",
+    "rgb": "image",
+    "pose": "world_from_cam (camera-to-world) or cam_from_world",
+    "extrinsics": "cam_from_world",
+    "extrinsic": "cam_from_world",
+    "transform_matrix": "world_from_cam, with axes x right, y down, z forward",
+    "c2w": "world_from_cam",
+    "w2c": "cam_from_world",
+    "unit": "units",
+    "scale": "units, or --scale of the command",
+    "distortion": "lens and coefficients",
+    "camera_model": "lens",
+    "dist_coeffs": "lens and coefficients",
+    "w": "width",
+    "h": "height",
+    "fl_x": "fx",
+    "fl_y": "fy",
+}
+"""What keys of other programs are called here."""
 _NUMBERS = ("fx", "fy", "cx", "cy", "width", "height", "version", "depth_scale")
 _LISTS = ("coefficients", "cam_from_world", "world_from_cam", "depth_range")
 FILE_LIMIT = 256 * 2**20
@@ -45,8 +84,9 @@ def check_keys(fields: Fields, known: Iterable[str]) -> None:
     wrong = next((key for key in fields.values if key not in known), None)
     if wrong is None:
         return
-    near = difflib.get_close_matches(wrong.lower(), known, n=1, cutoff=0.5)
-    remedy = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+    near = difflib.get_close_matches(wrong.lower(), known, n=1, cutoff=0.6)
+    meant = MEANT.get(wrong.lower()) or (near[0] if near else None)
+    remedy = f"did you mean {meant}?" if meant else f"known are {', '.join(known)}"
     raise UserError(f"{fields.where} has an unknown key {wrong[:40]!r}", fields.path, remedy)
 
 

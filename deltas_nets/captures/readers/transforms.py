@@ -33,6 +33,7 @@ from deltas_nets.captures.readers.names import (
 from deltas_nets.captures.readers.ply import read_points
 from deltas_nets.captures.readers.scannet import world_from_cam_inverse
 from deltas_nets.captures.readers.transforms_cameras import StatedCamera, stated_camera
+from deltas_nets.captures.readers.units import is_metric
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "recognises"]
@@ -202,7 +203,7 @@ def _depth(entry: _Entry, finder: FileFinder) -> tuple[Path | None, float]:
 def _metric(root: Fields, frames: list[Frame]) -> bool:
     """What the file says of its unit (our word), else whether a sensor measured depth in it."""
     if "units" in root:
-        return root.text("units") in ("metres", "meters", "m")
+        return is_metric(root)
     return any(frame.depth_path is not None for frame in frames)
 
 

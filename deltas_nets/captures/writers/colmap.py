@@ -16,30 +16,30 @@ from deltas_nets.captures.colmap_model import (
 from deltas_nets.captures.rotations import quaternions_of
 from deltas_nets.captures.writers.colmap_binary import write_binary_model
 from deltas_nets.captures.writers.colmap_text import write_text_model
-from deltas_nets.captures.writers.files import Placing, image_name, put_image
+from deltas_nets.captures.writers.files import Putting, image_name, put_image
 from deltas_nets.errors import UserError
 
 __all__ = ["model_of_capture", "write_binary", "write_text"]
 
 
-def write_text(capture: Capture, folder: Path, placing: Placing) -> list[str]:
+def write_text(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     """Write text files; see `deltas_nets.captures.writers` for the contract."""
-    model = _put_images(capture, folder, placing)
+    model = _put_images(capture, folder, putting)
     write_text_model(model, folder / "sparse" / "0")
     return _left_out(capture)
 
 
-def write_binary(capture: Capture, folder: Path, placing: Placing) -> list[str]:
+def write_binary(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     """Write binary files; see `deltas_nets.captures.writers` for the contract."""
-    model = _put_images(capture, folder, placing)
+    model = _put_images(capture, folder, putting)
     write_binary_model(model, folder / "sparse" / "0")
     return _left_out(capture)
 
 
-def _put_images(capture: Capture, folder: Path, placing: Placing) -> ColmapModel:
+def _put_images(capture: Capture, folder: Path, putting: Putting) -> ColmapModel:
     model = model_of_capture(capture)
     for name, frame in zip(model.images.names, capture.frames.values(), strict=True):
-        put_image(frame, folder / "images" / name, placing)
+        put_image(frame, folder / "images" / name, putting)
     (folder / "sparse" / "0").mkdir(parents=True)
     return model
 

@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -21,6 +21,7 @@ from deltas_nets.errors import UserError
 __all__ = [
     "Placing",
     "PutDepth",
+    "Putting",
     "check_no_skew",
     "depth_is_registered",
     "image_name",
@@ -34,6 +35,19 @@ __all__ = [
 
 Placing = Literal["copy", "link"]
 """How images come to a folder: copied, or as links to where they are."""
+
+
+class Putting(NamedTuple):
+    """How files come to a folder.
+
+    Attributes:
+        placing: copied or linked.
+        report: called with the id of every frame whose image is there.
+    """
+
+    placing: Placing
+    report: Callable[[str], None]
+
 
 MOST = 65534 / MILLIMETRES
 """Metres that 16 bits of millimetres hold; 65535 means unknown to some."""
@@ -72,22 +86,24 @@ def image_name(frame: Frame) -> str:
         return f"{frame.id}{'.jpg' if file.read(2) == _JPEG else '.png'}"
 
 
-def put_image(frame: Frame, target: Path, placing: Placing) -> None:
+def put_image(frame: Frame, target: Path, putting: Putting) -> None:
     """Bring the image of a frame to a place, bit by bit as it is.
 
     Raises:
         UserError: the file is missing.
     """
-    _put(_Source(frame.image_path, frame.image_span), target, placing, f"image of {frame.id}")
+    source = _Source(frame.image_path, frame.image_span)
+    _put(source, target, putting.placing, f"image of {frame.id}")
+    putting.report(frame.id)
 
 
-def put_depth(frame: Frame, target: Path, placing: Placing) -> PutDepth | None:
+def put_depth(frame: Frame, target: Path, putting: Putting) -> PutDepth | None:
     """Bring the depth of a frame to a place, as it is.
 
     Args:
         frame: whose depth.
         target: the place, without suffix.
-        placing: how.
+        putting: how.
 
     Returns:
         None where the frame has no depth.
@@ -98,14 +114,14 @@ def put_depth(frame: Frame, target: Path, placing: Placing) -> PutDepth | None:
     if frame.depth_span is not None or suffix not in DEPTH_SUFFIXES:
         return write_millimetres(frame.read_depth(), target, frame)
     file = target.with_name(target.name + suffix)
-    _put(_Source(frame.depth_path, None), file, placing, f"depth of {frame.id}")
+    _put(_Source(frame.depth_path, None), file, putting.placing, f"depth of {frame.id}")
     return PutDepth(file, frame.depth_scale)
 
 
-def put_registered_depth(frame: Frame, target: Path, placing: Placing) -> PutDepth | None:
+def put_registered_depth(frame: Frame, target: Path, putting: Putting) -> PutDepth | None:
     """The same for formats without a depth camera: what another saw is moved to the image."""
     if frame.depth_path is None or depth_is_registered(frame):
-        return put_depth(frame, target, placing)
+        return put_depth(frame, target, putting)
     return write_millimetres(register_depth(frame), target, frame)
 
 
@@ -155,10 +171,11 @@ def depth_is_registered(frame: Frame) -> bool:
     return bool(np.abs(expected - frame.depth_K).max() < 0.6)
 
 
-def put_image_as_png(frame: Frame, target: Path) -> None:
+def put_image_as_png(frame: Frame, target: Path, putting: Putting) -> None:
     """Write the image of a frame as PNG, where a format takes no other."""
     target.parent.mkdir(parents=True, exist_ok=True)
     decode(frame.image_path, frame.image_span, remedy="copy it again").convert("RGB").save(target)
+    putting.report(frame.id)
 
 
 def check_no_skew(capture: Capture, format: str) -> None:

@@ -11,7 +11,7 @@ from deltas_nets.captures.points import SparsePoints
 from deltas_nets.captures.readers.own_points import OBSERVATIONS, POINTS
 from deltas_nets.captures.readers.own_table import VERSION
 from deltas_nets.captures.writers.files import (
-    Placing,
+    Putting,
     check_no_skew,
     image_name,
     put_depth,
@@ -22,7 +22,7 @@ from deltas_nets.captures.writers.files import (
 __all__ = ["write"]
 
 
-def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
+def write(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     """Write everything; see `deltas_nets.captures.writers` for the contract."""
     check_no_skew(capture, "our own format")
     cameras = {f"{index}": _camera(frame) for index, frame in enumerate(_first_of_each(capture))}
@@ -34,7 +34,7 @@ def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
     }
     if capture.points is not None:
         root |= _put_points(capture.points, folder)
-    frames = [_frame(capture, index, folder, placing) for index in range(len(capture.frames))]
+    frames = [_frame(capture, index, folder, putting) for index in range(len(capture.frames))]
     write_frames_json(folder / "frames.json", root, frames)
     return []
 
@@ -58,17 +58,17 @@ def _numbers(K: FloatArray) -> dict[str, object]:
     return {name: float(K[place]) for name, place in places.items()}
 
 
-def _frame(capture: Capture, index: int, folder: Path, placing: Placing) -> dict[str, object]:
+def _frame(capture: Capture, index: int, folder: Path, putting: Putting) -> dict[str, object]:
     frame = capture.frames.at(index)
     name = f"images/{image_name(frame)}"
-    put_image(frame, folder / name, placing)
+    put_image(frame, folder / name, putting)
     said: dict[str, object] = {
         "id": id_in_json(frame.id),
         "image": name,
         "camera": str(capture.frames.arrays.camera_of[index]),
         "cam_from_world": frame.cam_from_world.tolist(),
     }
-    depth = put_depth(frame, folder / "depth" / frame.id, placing)
+    depth = put_depth(frame, folder / "depth" / frame.id, putting)
     if depth is not None:
         said["depth"] = depth.path.relative_to(folder).as_posix()
         said["depth_scale"] = depth.scale

@@ -14,7 +14,7 @@ from deltas_nets.captures.images import in_words
 from deltas_nets.captures.readers.scannet import IMAGE_SUFFIXES
 from deltas_nets.captures.register import register_depth
 from deltas_nets.captures.writers.files import (
-    Placing,
+    Putting,
     image_name,
     put_depth,
     put_image,
@@ -29,7 +29,7 @@ TABLE = "ids.txt"
 """Which number stands for which frame, where ids are no numbers."""
 
 
-def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
+def write(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     """Write the folders; see `deltas_nets.captures.writers` for the contract."""
     _check(capture)
     ids = list(capture.frames)
@@ -41,8 +41,8 @@ def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
     if of_depth is not None:
         _write_matrix(folder / "intrinsic" / "intrinsic_depth.txt", of_depth)
     for name, frame in zip(names, capture.frames.values(), strict=True):
-        _put_image(frame, folder / "color" / name, placing)
-        _put_depth(frame, folder / "depth" / name, placing, registered=of_depth is None)
+        _put_image(frame, folder / "color" / name, putting)
+        _put_depth(frame, folder / "depth" / name, putting, registered=of_depth is None)
         world_from_cam = np.linalg.inv(frame.cam_from_world).astype(np.float64)
         _write_matrix(folder / "pose" / f"{name}.txt", world_from_cam)
     said = []
@@ -87,15 +87,15 @@ def _one_depth_camera(capture: Capture) -> FloatArray | None:
     return next(iter(matrices.values())) if len(matrices) == 1 and not moved else None
 
 
-def _put_image(frame: Frame, target: Path, placing: Placing) -> None:
+def _put_image(frame: Frame, target: Path, putting: Putting) -> None:
     suffix = Path(image_name(frame)).suffix
     if suffix in IMAGE_SUFFIXES:
-        put_image(frame, target.with_name(target.name + suffix), placing)
+        put_image(frame, target.with_name(target.name + suffix), putting)
     else:
-        put_image_as_png(frame, target.with_name(f"{target.name}.png"))
+        put_image_as_png(frame, target.with_name(f"{target.name}.png"), putting)
 
 
-def _put_depth(frame: Frame, target: Path, placing: Placing, *, registered: bool) -> None:
+def _put_depth(frame: Frame, target: Path, putting: Putting, *, registered: bool) -> None:
     """Depth as PNG in millimetres: as it is where it is that, else written anew."""
     path = frame.depth_path
     if path is None:
@@ -104,7 +104,7 @@ def _put_depth(frame: Frame, target: Path, placing: Placing, *, registered: bool
     if registered and (frame.depth_K is not None or frame.cam_from_depth is not None):
         write_millimetres(register_depth(frame), target, frame)
     elif as_it_is:
-        put_depth(frame, target, placing)
+        put_depth(frame, target, putting)
     else:
         write_millimetres(frame.read_depth(), target, frame)
 

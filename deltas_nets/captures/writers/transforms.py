@@ -9,8 +9,8 @@ from deltas_nets.captures.depth_files import MILLIMETRES
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.points import SparsePoints
 from deltas_nets.captures.writers.files import (
-    Placing,
     PutDepth,
+    Putting,
     check_no_skew,
     depth_is_registered,
     image_name,
@@ -39,7 +39,7 @@ _NAMES = {
 """By COLMAP's name: the one of transforms.json, and its names of the coefficients."""
 
 
-def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
+def write(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     """Write the file, images/ and depth/; see `deltas_nets.captures.writers` for the contract."""
     check_no_skew(capture, "transforms.json")
     for camera in capture.frames.arrays.cameras:
@@ -58,14 +58,14 @@ def write(capture: Capture, folder: Path, placing: Placing) -> list[str]:
         said.append(
             "which frame sees which sparse point is left out: the format has no place for it"
         )
-    frames = [_frame(frame, folder, placing, scale) for frame in capture.frames.values()]
+    frames = [_frame(frame, folder, putting, scale) for frame in capture.frames.values()]
     write_frames_json(folder / "transforms.json", root, frames)
     return said
 
 
-def _frame(frame: Frame, folder: Path, placing: Placing, scale: float) -> dict[str, object]:
+def _frame(frame: Frame, folder: Path, putting: Putting, scale: float) -> dict[str, object]:
     name = f"images/{image_name(frame)}"
-    put_image(frame, folder / name, placing)
+    put_image(frame, folder / name, putting)
     height, width = frame.image_size
     said: dict[str, object] = {
         "file_path": name,
@@ -78,24 +78,24 @@ def _frame(frame: Frame, folder: Path, placing: Placing, scale: float) -> dict[s
         **_lens(frame.lens, frame.image_path),
         "transform_matrix": (np.linalg.inv(frame.cam_from_world) @ OPENGL).tolist(),
     }
-    depth = _put_depth(frame, folder / "depth" / frame.id, placing, scale)
+    depth = _put_depth(frame, folder / "depth" / frame.id, putting, scale)
     if depth is not None:
         said["depth_file_path"] = depth.path.relative_to(folder).as_posix()
     return said
 
 
-def _put_depth(frame: Frame, target: Path, placing: Placing, scale: float) -> PutDepth | None:
+def _put_depth(frame: Frame, target: Path, putting: Putting, scale: float) -> PutDepth | None:
     """Depth at the steps that the file states of all, which is what most have already."""
     as_it_is = frame.depth_scale == scale and frame.depth_span is None
     if frame.depth_path is None or (as_it_is and depth_is_registered(frame)):
-        return put_registered_depth(frame, target, placing)
+        return put_registered_depth(frame, target, putting)
     if scale != MILLIMETRES:
         what = f"depth has {scale:g} steps in a unit, and some must be written anew"
         raise UserError(what, frame.depth_path, "use --to own")
     return (
         write_millimetres(frame.read_depth(), target, frame)
         if depth_is_registered(frame)
-        else put_registered_depth(frame, target, placing)
+        else put_registered_depth(frame, target, putting)
     )
 
 

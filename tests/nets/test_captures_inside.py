@@ -1,0 +1,42 @@
+"""A folder that holds captures and is none itself is refused, and they are named."""
+
+from pathlib import Path
+
+import pytest
+from small_capture import write_capture
+
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
+from deltas_nets.errors import UserError
+
+
+def _with(folder: Path, **kinds: str) -> None:
+    """Captures of formats, by the names of their folders."""
+    for name, to in kinds.items():
+        capture = open_capture(write_capture(folder / f".{name}", num_frames=2))
+        save_capture(capture, folder / name, to)
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        {"a": "own"},
+        {"a": "own", "b": "transforms"},
+        {"a": "own", "b": "colmap"},
+        {"a": "own", "b": "scannet", "c": "colmap-bin"},
+    ],
+)
+def test_captures_of_any_format_are_counted_and_named(
+    tmp_path: Path, kinds: dict[str, str]
+) -> None:
+    _with(tmp_path / "all", **kinds)
+    with pytest.raises(UserError) as error:
+        open_capture(tmp_path / "all")
+    assert ", ".join(kinds) in error.value.what and error.value.where == tmp_path / "all"
+    assert str(tmp_path / "all" / "a") in error.value.remedy
+
+
+def test_a_capture_may_hold_others(tmp_path: Path) -> None:
+    _with(tmp_path, whole="colmap")
+    _with(tmp_path / "whole", nerf="transforms", mine="own")
+    assert open_capture(tmp_path / "whole").layout == "COLMAP text"
