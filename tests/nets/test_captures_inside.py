@@ -13,7 +13,7 @@ from deltas_nets.errors import UserError
 def _with(folder: Path, **kinds: str) -> None:
     """Captures of formats, by the names of their folders."""
     for name, to in kinds.items():
-        capture = open_capture(write_capture(folder / f".{name}", num_frames=2))
+        capture = open_capture(write_capture(folder.parent / "read" / name, num_frames=2))
         save_capture(capture, folder / name, to)
 
 
