@@ -13,6 +13,7 @@ from run_command import Run, assert_one_line
 from small_capture import write_capture
 
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.fuse import FuseConfig
 from deltas_nets.fuse.fusing import SUMMARY, fuse_capture
 from deltas_nets.fuse.sources import depth_source
@@ -200,3 +201,16 @@ def test_torch_has_its_threads_back(maps: tuple[Path, Path], tmp_path: Path) -> 
     source = depth_source(open_capture(maps[0]), maps[1])
     fuse_capture(source, tmp_path / "out", FuseConfig(voxel=0.1, neighbours=2))
     assert torch.get_num_threads() == before
+
+
+def test_the_depth_command_fuses_what_is_complete(maps: tuple[Path, Path]) -> None:
+    capture, folder = open_capture(maps[0]), maps[1]
+    wanted = {"cloud": False, "mesh": True, "overwrite": False}
+    fuse_maps(capture, folder, device="cpu", **wanted)
+    assert abs(vertices_of(folder / "mesh.ply")[:, 2] - 2.5).max() < 1e-3
+    assert not (folder / "cloud.ply").exists()
+    (folder / "mesh.ply").unlink()
+    summary = json.loads((folder / "summary.json").read_text())
+    (folder / "summary.json").write_text(json.dumps({**summary, "status": "stopped"}))
+    fuse_maps(capture, folder, device="cpu", **wanted)
+    assert not (folder / "mesh.ply").exists()

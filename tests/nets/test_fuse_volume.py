@@ -79,9 +79,9 @@ def test_voxels_hold_the_mean_signed_distance_of_all_views() -> None:
             column, row = round(float(x / z)), round(float(y / z))
             if z > 0 and 0 <= column < SIZE[1] and 0 <= row < SIZE[0]:
                 signed = float(view.depth[row, column] - z) / volume.truncation
-                if signed > -1:
+                if abs(signed) < 1:
                     one = float(view.std[row, column]) ** -2
-                    weight, distance = weight + one, distance + one * min(signed, 1.0)
+                    weight, distance = weight + one, distance + one * signed
         assert_close(sums[:2, voxel], torch.tensor([weight, distance]), rtol=1e-3, atol=1e-1)
 
 
