@@ -1,5 +1,6 @@
 """The page beside depth maps: what it says is what the files say, and it stays small."""
 
+import base64
 import json
 import re
 import shutil
@@ -17,12 +18,15 @@ from run_command import Run, assert_one_line
 from small_maps import write_maps
 
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.scaled import scaled
+from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.capture import evaluate_files
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.products import OWN_UNIT, OutputOptions
 from deltas_nets.outputs.summary import recorded_view_sets
 from deltas_nets.page import write
-from deltas_nets.page.budget import choose
+from deltas_nets.page.budget import Chosen, choose
 from deltas_nets.page.colours import (
     CONFIDENCE,
     ERROR,
@@ -37,6 +41,7 @@ from deltas_nets.page.maps import open_maps
 from deltas_nets.page.scene import camera_of, layers_of
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
 from deltas_nets.page.write import write_page
+from deltas_nets.weights_file import save_weights
 
 ODD = "a & b <script>alert(1)<！--</script> \u2028'\""
 """An id that no page may take for its own words; a file may be called so."""
@@ -99,6 +104,8 @@ def test_a_value_is_read_back_from_its_colour(low: float, ratio: float, share: f
 
 @pytest.mark.parametrize("scale", [CONFIDENCE, ERROR, Scale("turbo_r", 1, 2, "m", log=True)])
 def test_no_colour_is_near_the_grey_of_the_unknown(scale: Scale) -> None:
+    unknown = coloured(np.ones((1, 2), np.float32), scale, known=np.array([[False, True]]))
+    assert tuple(unknown[0, 0]) == NONE != tuple(unknown[0, 1])
     far = np.abs(lookup_table(scale).astype(int) - NONE).max(axis=1)
     assert far.min() > 20  # what a JPEG changes is less
 
@@ -138,10 +145,13 @@ def test_thinned_points_are_few_and_among_the_others(points: np.ndarray, most: i
 
 def test_a_thinned_mesh_keeps_its_shape(tmp_path: Path) -> None:
     mesh = mesh_of(tmp_path)
-    few = thinned(mesh, 800)
+    assert mesh.faces is not None
+    twice = mesh._replace(faces=np.concatenate([mesh.faces, np.roll(mesh.faces, 1, axis=1)]))
+    few = thinned(twice, 800)
     assert few.faces is not None and 400 < len(few.faces) <= 800
     assert few.faces.max() < len(few.xyz)
-    assert (np.diff(np.sort(few.faces, axis=1)) > 0).all()  # three corners each
+    corners = np.sort(few.faces, axis=1)
+    assert (np.diff(corners) > 0).all() and len(np.unique(corners, axis=0)) == len(corners)
     corners = few.xyz[few.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(1.2, rel=0.2)  # m^2
@@ -245,6 +255,31 @@ def test_points_of_the_maps_are_shown_where_they_are(filled: tuple[Path, Path]) 
     assert mesh.name == "mesh" and mesh.surface.faces is not None
 
 
+def test_the_scene_on_the_page_is_in_the_world(filled: tuple[Path, Path]) -> None:
+    capture, folder = filled
+    page_of(capture, folder)
+    scene = data_of(folder)["scene"]
+    pose = np.array(scene["cameras"][1]["pose"]).reshape(3, 4)
+    origin = np.array([0.15, 0, 0]) - pose[:, 3]  # where frame 1 stands
+    (layer,) = scene["layers"]
+    steps = np.frombuffer(base64.b64decode(layer["xyz"]), "<u2").reshape(-1, 3) / 65535
+    shown = origin + np.array(layer["low"]) + steps * np.array(layer["span"])
+    (real,) = layers_of(open_maps(open_capture(capture), folder))
+    np.testing.assert_allclose(shown, real.surface.xyz, atol=1e-4)  # m
+
+
+def test_maps_know_the_scale_that_they_were_made_with(
+    make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    capture = make_capture()
+    folder = write_maps(scaled(scaled(open_capture(capture), 4), 0.5), tmp_path / "maps")
+    maps = open_maps(open_capture(capture), folder)
+    assert maps.capture.frame("3").cam_from_world[0, 3] == pytest.approx(-2 * 0.45)  # m
+    assert open_maps(maps.capture, folder).capture is maps.capture
+    other = open_maps(scaled(open_capture(capture), 8), folder).capture
+    assert other.fingerprint() == maps.capture.fingerprint()
+
+
 def test_unsure_points_are_left_out(filled: tuple[Path, Path]) -> None:
     capture, folder = filled
     half = np.zeros((48, 64), np.uint8)
@@ -266,6 +301,16 @@ def test_a_page_of_many_maps_stays_small(
     data = data_of(folder)
     assert f"{page.shown} of 4 maps" in page.line and f"{page.shown} of 4" in data["notes"][0]
     assert len(data["scene"]["cameras"]) == 4 and len(list((folder / "preview").iterdir())) == 4
+
+
+def test_a_page_that_was_misjudged_leaves_frames_out(
+    filled: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture, folder = filled
+    monkeypatch.setattr(write, "MOST_BYTES", page_of(capture, folder).size - 8000)
+    monkeypatch.setattr(write, "choose", lambda ids, *_: Chosen(tuple(ids), 640))
+    page = page_of(capture, folder)
+    assert page.size <= write.MOST_BYTES and page.shown == 2
 
 
 def test_a_capture_without_metres_sensor_or_confidence(
@@ -297,6 +342,28 @@ def test_ids_are_not_taken_for_the_pages_own_words(
     page = write.html_of(maps, [frame._replace(id=ODD)], [], ERROR, (0.5, 10))
     (folder / "index.html").write_bytes(page)
     assert data_of(folder)["frames"][0]["id"] == ODD
+
+
+def test_depth_ends_with_a_page_unless_told_otherwise(
+    run: Run, make_capture: MakeCapture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = NetworkConfig(
+        detector=DetectorConfig(num_keypoints=48), matcher=MatcherConfig(num_samples=32)
+    )
+    save_weights(tmp_path / "small.safetensors", Deltas(config), {"step": "0"})
+    command = ["depth", make_capture(2), "--weights", tmp_path / "small.safetensors", "--out"]
+    without = run(*command, tmp_path / "without", "--no-page")
+    assert without.code == 0 and not (tmp_path / "without" / "index.html").exists()
+    shown = run(*command, tmp_path / "with")
+    assert f"look at {tmp_path / 'with' / 'index.html'}" in shown.out
+    assert len(data_of(tmp_path / "with")["frames"]) == 2
+
+    def full(*_: object, **__: object) -> None:
+        raise UserError("no space", "disk", "make some")
+
+    monkeypatch.setattr(write, "write_page", full)
+    hindered = run(*command, tmp_path / "hindered")
+    assert hindered.code == 0 and "no space" in hindered.warnings[-1]
 
 
 # What is wrong

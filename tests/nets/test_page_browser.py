@@ -115,7 +115,7 @@ def test_the_scene_is_drawn_and_turns_with_a_drag_and_keys(page: Any) -> None:
     first = picture_of(page, "#canvas")
     ground = np.median(first.reshape(-1, 3), axis=0)
     assert (np.abs(first - ground).max(axis=-1) > 30).mean() > 0.05
-    drag(page, "#canvas", 120, 30)
+    drag(page, "#canvas", 120)
     turned = picture_of(page, "#canvas")
     assert changed(first, turned) > 0.05
     page.find_element("id", "reset").click()
