@@ -72,8 +72,16 @@ def usable_view_sets(
     return UsableViews(view_sets, sum(len(views.sources) < wanted - 1 for views in view_sets))
 
 
-def lone_frames(capture: Capture, anchors: Sequence[str] | None) -> UsableViews:
-    """Frames without sources, for maps that rest on measured depth alone; all if none are named."""
+def lone_frames(capture: Capture, file: Path | None, anchors: Sequence[str] | None) -> UsableViews:
+    """Anchors without sources, for maps that rest on measured depth alone.
+
+    Args:
+        capture: the frames.
+        file: of view sets, whose anchors are meant, or None.
+        anchors: the frames, where no file says it; all if not given.
+    """
+    if file is not None:
+        anchors = [views.anchor for views in read_view_sets(file, capture)]
     chosen = capture.frames if anchors is None else anchors
     return UsableViews(tuple(ViewSet(id, ()) for id in chosen), 0)
 

@@ -106,7 +106,6 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.predict.first_look import ANCHORS, ROUNDS, depth_seen
 
         shard = read_shard(self.shard)
-        self._check()
         config = self.config(size=self.size, min_confidence=self.min_confidence)
         options = self._options()
         capture = self.opened(self.capture).remembering()
@@ -118,7 +117,7 @@ class Depth(Captured, Measuring, Prediction):
                 depth = depth_seen(predictor, capture, config, report=report)
         anchors = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
-            found = lone_frames(capture, anchors)
+            found = lone_frames(capture, self.view_sets, anchors)
         else:
             found = usable_view_sets(
                 capture, self.view_sets, self.views, working_depth=depth, anchors=anchors
@@ -148,26 +147,17 @@ class Depth(Captured, Measuring, Prediction):
         )
         tell(outcome, folder, options, self.format)
         if self.mesh or self.cloud:
-            wanted = {"mesh": self.mesh, "cloud": self.cloud}
-            fuse_maps(capture, self.folder, wanted, self.device, overwrite=self.overwrite)
+            wanted = {"mesh": self.mesh, "cloud": self.cloud, "overwrite": self.overwrite}
+            fuse_maps(capture, self.folder, device=self.device, **wanted)
         if self.page:
             show(capture, self.folder, self.range)
-
-    def _check(self) -> None:
-        if self.passes not in (1, 2):
-            raise UserError("there is no such pass", f"--passes {self.passes}", "use 1 or 2")
-        if self.workers is not None and self.workers < 1:
-            raise UserError("too few workers", f"--workers {self.workers}", "use 1 or more")
-        if self.views == 1 and self.sensor_depth is None:
-            what = "one view alone has no depth"
-            raise UserError(what, "--views 1", "use 2 or more, or add --sensor-depth")
 
     def _search(self, capture: "Capture") -> "Search":
         from deltas_nets.predict.search import Asked, Completed, Followed
 
         measured = self.measured(capture)
         if self.views == 1:
-            assert measured is not None  # or `_check` would have refused
+            assert measured is not None  # or the flag would have been refused
             return Completed(capture, measured)
         if self.depth_range is None:
             return Followed(capture, measured)

@@ -35,9 +35,6 @@ class Measuring:
         from deltas_nets.captures.measured import ByHand, OfPoints, OfSensor, measured_by_hand
 
         name, deviation = str(self.sensor_depth), self.sensor_deviation
-        if deviation is not None and not 0 < deviation < 1:
-            what = "no standard deviation, as a share of the depth"
-            raise UserError(what, f"--sensor-deviation {deviation:g}", "give a number in 0 to 1")
         if self.sensor_depth is None:
             return None
         if name != "points" and not capture.metric:

@@ -12,6 +12,7 @@ from deltas_nets.errors import UserError
 __all__ = ["check_values"]
 
 LEAST_SIDE = 32  # px
+_TWO_VIEWS = "use 2 or more, or let deltas depth complete --sensor-depth"
 
 
 def check_values(command: Command) -> None:
@@ -26,6 +27,9 @@ def check_values(command: Command) -> None:
         value, check = getattr(command, field.name), CHECKS.get(field.name)
         if value is not None and check is not None:
             check(value, f"--{field.name.replace('_', '-')}")
+    views, measured = (getattr(command, name, None) for name in ("views", "sensor_depth"))
+    if views == 1 and measured is None:
+        raise UserError("one view alone has no depth", "--views 1", _TWO_VIEWS)
 
 
 def _range(value: tuple[float, float], flag: str) -> None:
@@ -40,9 +44,14 @@ def _size(value: tuple[int, int], flag: str) -> None:
         raise UserError("too small", f"{flag} {given}", f"use HEIGHT WIDTH of {LEAST_SIDE} or more")
 
 
-def _views(value: int, flag: str) -> None:
-    if value < 2:
-        raise UserError("too few views", f"{flag} {value}", "use 2 or more")
+def _count(value: int, flag: str) -> None:
+    if value < 1:
+        raise UserError("too few", f"{flag} {value}", "use 1 or more")
+
+
+def _passes(value: int, flag: str) -> None:
+    if value not in (1, 2):
+        raise UserError("there is no such pass", f"{flag} {value}", "use 1 or 2")
 
 
 def _positive(value: float, flag: str) -> None:
@@ -66,8 +75,14 @@ def _file(value: Path, flag: str) -> None:
 
 
 def _depths(value: Path, flag: str) -> None:
-    if str(value) != "sensor":
+    if str(value) not in ("sensor", "points"):
         _file(value, flag)
+
+
+def _share(value: float, flag: str) -> None:
+    if not 0 < value < 1:
+        what = "no standard deviation as a share of the depth"
+        raise UserError(what, f"{flag} {value:g}", "use more than 0 and less than 1")
 
 
 def _intrinsics(value: str, flag: str) -> None:
@@ -80,7 +95,11 @@ CHECKS: Mapping[str, Callable[[Any, str], None]] = {
     "depth_range": _range,
     "size": _size,
     "work_size": _size,
-    "views": _views,
+    "views": _count,
+    "workers": _count,
+    "passes": _passes,
+    "sensor_depth": _depths,
+    "sensor_deviation": _share,
     "scale": _positive,
     "depth_scale": _positive,
     "min_confidence": _part,

@@ -84,7 +84,7 @@ def test_a_depth_that_contradicts_all_others_says_nothing(seed: int) -> None:
     doubted = process.places.pixels[process.doubt > 100].tolist()
     assert doubted == [wrong]
     at = everywhere(log_depth)
-    assert_close(process(at), alone(at), rtol=0, atol=0.01)
+    assert_close(process(at), alone(at), rtol=0, atol=0.02)
     believed = reconciled(
         SparseDepth(*(torch.zeros_like(part) for part in known)),
         KnownDepth(known.depth, torch.full_like(known.depth, 0.01)),

@@ -1,0 +1,130 @@
+"""`deltas depth` in two passes, by threads, killed and continued; and with measured depth."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from run_command import Result, Run, assert_one_line
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.outputs.depth_formats import read_depth_map
+from deltas_nets.outputs.first_maps import FIRST, FirstMaps
+from deltas_nets.outputs.folder import OutputFolder
+
+IDS = [str(id) for id in range(5)]
+
+
+@pytest.fixture(scope="session")
+def scene(scannet_root: Path) -> Path:
+    return scannet_root / "scans" / "scene0000_00"
+
+
+@pytest.fixture
+def depth(run: Run, scene: Path, tmp_path: Path) -> Any:
+    sets = tmp_path / "sets.json"
+    listed = [{"anchor": id, "sources": [(id + 1) % 5, (id + 2) % 5]} for id in range(5)]
+    sets.write_text(json.dumps(listed))
+
+    def depth(name: str, *flags: object) -> Result:
+        fixed = ("--out", tmp_path / name, "--format", "npz", "--no-page", "--view-sets", sets)
+        return run("depth", scene, *fixed, "--work-size", 64, 96, *flags)
+
+    return depth
+
+
+def maps(folder: Path) -> np.ndarray:
+    return np.stack([read_depth_map(folder, id, 1000) for id in IDS])
+
+
+def truth_of(capture: Capture) -> np.ndarray:
+    return np.stack([depth_at_image(capture.frame(id)) for id in IDS])
+
+
+def error(found: np.ndarray, true: np.ndarray) -> float:
+    known = (true > 0.5) & (true < 10)
+    return float((np.abs(found - true)[known] / true[known]).mean())
+
+
+def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
+    depth: Any, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert depth("once", "--passes", 1).code == 0
+    said = depth("whole", "--workers", 1)
+    assert said.code == 0 and "at a time" not in said.out
+    assert not (tmp_path / "whole" / FIRST).exists()
+    assert depth("threads", "--workers", 3).code == 0
+    assert np.allclose(maps(tmp_path / "threads"), maps(tmp_path / "whole"), rtol=1e-5)
+
+    # Stopped in the first pass, stopped in the second, and finished.
+    keep, write, calls = FirstMaps.write, OutputFolder.write_frame, []
+
+    def stopped(function: Any, at: int) -> Any:
+        def call(*arguments: Any) -> None:
+            calls.append(1)
+            if len(calls) == at:
+                raise KeyboardInterrupt
+            function(*arguments)
+
+        return call
+
+    monkeypatch.setattr(FirstMaps, "write", stopped(keep, 4))
+    assert depth("broken", "--workers", 1).code == 130
+    monkeypatch.setattr(FirstMaps, "write", keep)
+    monkeypatch.setattr(OutputFolder, "write_frame", stopped(write, 7))
+    assert depth("broken", "--workers", 1).code == 130
+    assert len(list((tmp_path / "broken" / FIRST).iterdir())) == 5
+    (tmp_path / "broken" / FIRST / "4.safetensors").write_bytes(b"cut")
+    monkeypatch.setattr(OutputFolder, "write_frame", write)
+    assert depth("broken", "--workers", 1).code == 0
+    assert np.allclose(maps(tmp_path / "broken"), maps(tmp_path / "whole"), rtol=1e-5)
+
+    assert not np.allclose(maps(tmp_path / "whole"), maps(tmp_path / "once"), rtol=1e-2)
+    summary = json.loads((tmp_path / "whole" / "summary.json").read_text())
+    assert all("valid_points" in frame for frame in summary["frames"].values())
+
+
+def test_measured_depth_makes_maps_better_and_alone_completes_them(
+    depth: Any, scene: Path, tmp_path: Path
+) -> None:
+    true = truth_of(open_capture(scene))
+    rows = []
+    for id, map_ in zip(IDS, true, strict=True):
+        for row, column in np.argwhere(map_ > 0)[::400]:
+            rows.append(f"{id} {column} {row} {map_[row, column]:.4f}")
+    file = tmp_path / "by_hand.txt"
+    file.write_text("\n".join(rows))
+    assert depth("none", "--passes", 1).code == 0
+    errors = {"none": error(maps(tmp_path / "none"), true)}
+    for name, flags in {
+        "by-hand": ("--sensor-depth", file),
+        "sensor": ("--sensor-depth", "sensor"),
+        "alone": ("--sensor-depth", "sensor", "--views", 1),
+    }.items():
+        said = depth(name, "--passes", 1, *flags)
+        assert said.code == 0, said.err
+        errors[name] = error(maps(tmp_path / name), true)
+    assert errors["by-hand"] < 0.8 * errors["none"]
+    assert errors["sensor"] < 0.5 * errors["none"]
+    assert errors["alone"] < 0.5 * errors["none"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "parts"),
+    [
+        (("--views", 1), ("--views 1", "--sensor-depth")),
+        (("--passes", 3), ("--passes 3",)),
+        (("--workers", 0), ("--workers 0",)),
+        (("--sensor-depth", "points"), ("no sparse points",)),
+        (("--sensor-depth", "nowhere.txt"), ("nowhere.txt",)),
+        (("--sensor-depth", "sensor", "--sensor-deviation", 2), ("--sensor-deviation 2",)),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(
+    depth: Any, tmp_path: Path, flags: tuple[object, ...], parts: tuple[str, ...]
+) -> None:
+    assert_one_line(depth("out", *flags), *parts)
+    assert not (tmp_path / "out").exists()
