@@ -10,6 +10,7 @@ from deltas_nets.captures.opening import open_capture
 from deltas_nets.outputs.folder import prepare_output
 from deltas_nets.outputs.products import FrameOutput, OutputOptions
 from deltas_nets.page.scene import camera_of
+from deltas_nets.page.surfaces import Surface
 
 NEAR, FAR = 2.0, 3.0
 """Metres, at the left and at the right of every map; the sensor says 2.5 everywhere."""
@@ -57,3 +58,26 @@ def write_maps(
         )
     folder.write_summary("complete")
     return out
+
+
+def mesh_of(folder: Path, corners: int = 40) -> Surface:
+    """A wavy sheet of triangles, written as ``deltas fuse`` does."""
+    x, y = np.meshgrid(np.linspace(0, 1, corners), np.linspace(0, 1, corners))
+    xyz = np.stack([x, y, 0.1 * np.sin(9 * x)], axis=-1).reshape(-1, 3)
+    rgb = np.random.default_rng(0).integers(0, 255, xyz.shape, dtype=np.uint8)
+    a = np.arange(corners * corners).reshape(corners, corners)
+    first = np.stack([a[:-1, :-1], a[1:, :-1], a[:-1, 1:]], axis=-1).reshape(-1, 3)
+    second = np.stack([a[:-1, 1:], a[1:, :-1], a[1:, 1:]], axis=-1).reshape(-1, 3)
+    faces = np.concatenate([first, second])
+    vertices = np.zeros(len(xyz), [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"], vertices["rgb"] = xyz, rgb
+    listed = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    listed["count"], listed["corners"] = 3, faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
+    lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    content = "\n".join([*lines, ""]).encode() + vertices.tobytes() + listed.tobytes()
+    folder.mkdir(exist_ok=True)
+    (folder / "mesh.ply").write_bytes(content)
+    return Surface(vertices["xyz"].astype(np.float64), rgb, faces)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from chromium import changed, chromium, picture_of, settled
 from small_capture import write_capture
-from small_maps import write_maps
-from test_page import mesh_of
+from small_maps import mesh_of, write_maps
 
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.page.maps import open_maps
