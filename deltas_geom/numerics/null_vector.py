@@ -185,17 +185,20 @@ def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
-    """x - (M - mu)^+ (M x), mu = x^T M x: the null vector with its derivatives.
+    """x - (M - mu)^+ (M x), mu = x^T M x: the null vector with its derivatives, and the value x.
 
     Args:
         matrix: positive semidefinite, finite.
         x: its null vector, of unit length and without gradient.
 
     Returns:
-        Of about unit length. Where M - mu is not definite in the complement of x, x itself.
+        Where M - mu is not definite in the complement of x, x without derivatives.
     """
     image = multiply(matrix, x)
-    change = solve_in_complement(matrix, x, dot(x, image), image)
+    # M x is mu x but for rounding, which the derivative of the inverse would multiply: by 1e9 where
+    # all but one of the weights are 1e-6.
+    i0, i1, i2, i3 = (component - component.detach() for component in image)
+    change = solve_in_complement(matrix, x, dot(x, image), (i0, i1, i2, i3))
     return x[0] - change[0], x[1] - change[1], x[2] - change[2], x[3] - change[3]
 
 

@@ -127,7 +127,7 @@ def alike_of(rig: Rig, frame: Frame, eps: float) -> Alike:
     weights = weigh(None, None, batch=like.shape[:-3], like=like, sound=None)
     framed = _framed(rig, rig_sums(rig.moments, weights), frame, eps)
     # Few cameras are moved, not every matrix.
-    return Alike(framed, normal_coefficients(cameras_in_frame(rig.near, framed)))
+    return Alike(framed, normal_coefficients(cameras_in_frame(rig.near, framed.held())))
 
 
 def equations_of(
@@ -159,7 +159,8 @@ def equations_of(
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = _of_all(made, parts)
     normal = m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
     if alike is None:
-        normal = in_frame(normal, framed.origin, framed.unit)
+        held = framed.held()
+        normal = in_frame(normal, held.origin, held.unit)
     framed = framed._replace(finite=framed.finite & sound)
     return Equations(rig, framed, normal, parts, eps, frame == "world")
 

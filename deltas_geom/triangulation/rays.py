@@ -138,8 +138,9 @@ def _pose(
     moments = camera_moments(seen.centers, seen.datum, seen.broken)
     frame = rig_frame(*rig_sums(moments, seen.weights), eps=torch.finfo(rays.dtype).eps)
     frame = frame._replace(finite=frame.finite & seen.weights.sound)
-    unit = frame.unit.unsqueeze(-2)
-    o0, o1, o2 = (part / unit for part in seen.offsets(frame.origin))
+    held = frame.held()
+    unit = held.unit.unsqueeze(-2)
+    o0, o1, o2 = (part / unit for part in seen.offsets(held.origin))
     normal = _normal_matrix(seen.directions, (o0, o1, o2), seen.weights.squared)
     return _Posed(seen, (o0, o1, o2), frame, normal)
 

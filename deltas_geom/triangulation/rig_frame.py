@@ -40,6 +40,11 @@ class RigFrame(NamedTuple):
     enough: Tensor
     finite: Tensor
 
+    def held(self) -> "RigFrame":
+        """The frame in which matrices are made: what depends on it is known without them."""
+        ox, oy, oz = (part.detach() for part in self.origin)
+        return self._replace(origin=(ox, oy, oz), unit=self.unit.detach())
+
 
 def datum_of(centers: Tensor) -> Tensor:
     """A place in the world ``(*B, 1, 3)`` near the cameras: the origin of sums over them.

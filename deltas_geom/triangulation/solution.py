@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all
-from deltas_geom.numerics.ldl import Symmetric4, Vector4, unit
+from deltas_geom.numerics.ldl import Symmetric4, Vector4, dot, less, multiply, unit
 from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
 from deltas_geom.triangulation.judge import judge
 from deltas_geom.triangulation.observed import Vector3
@@ -145,14 +145,15 @@ def derivable_points(
     """Points relative to the origin of the sums, differentiable; finite where not valid.
 
     Args:
-        normal: as for :func:`find_points`, differentiable.
+        normal: as for :func:`find_points`, differentiable, but for the frame, which is held.
         frame: of the points.
         vector: found for ``normal``.
         valid: ``(*B, N)`` bool.
     """
     matrix, _ = of_trace_one(normal, valid)
-    x0, x1, x2, x3 = derivable_vector(matrix, vector, valid)
-    return _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
+    held = frame.held()
+    x0, x1, x2, x3 = derivable_vector(matrix, vector, valid, frame)
+    return _at_distance((x0, x1, x2), held.unit / x3, held.origin)
 
 
 def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]:
@@ -171,23 +172,52 @@ def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]
     return (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), share
 
 
-def derivable_vector(matrix: Symmetric4, vector: Vector4, valid: Tensor) -> Vector4:
-    """The null vector, of about unit length, as a function of the matrix of trace 1.
+def derivable_vector(
+    matrix: Symmetric4, vector: Vector4, valid: Tensor, frame: RigFrame
+) -> Vector4:
+    """The null vector, of about unit length, as a function of the matrix and of the frame.
 
     Args:
         matrix: of :func:`of_trace_one`.
         vector: its null vector, of any length; anything where not valid.
         valid: ``(*B, N)`` bool.
+        frame: of the points, differentiable.
     """
     x0, x1, x2, x3 = (
         torch.where(valid, component.detach(), constant)
         for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
     )
     start = unit((x0, x1, x2, x3))
-    x0, x1, x2, x3 = rayleigh_step(matrix, start)
+    x0, x1, x2, x3 = rayleigh_step(_measured(matrix, start, valid, frame), start)
     # Below the step's rounding there is no derivative, and not even a sign to divide by.
     lost = start[3].abs() <= 4 * torch.finfo(x3.dtype).eps
     return x0, x1, x2, torch.where(lost, start[3], x3)
+
+
+def _measured(matrix: Symmetric4, x: Vector4, valid: Tensor, frame: RigFrame) -> Symmetric4:
+    """M - mu (N - 1), which is M, with what the frame does to its null vector x.
+
+    In another frame S x stands for x, and x^T M x is the least at S^T S = N: M x = mu N x. To
+    derive S^T M S instead would leave the rounding of M x, which a small unit multiplies.
+    """
+    held, zero = frame.held(), torch.zeros_like(matrix[0])
+    grown = held.unit / frame.unit
+    b0, b1, b2 = (
+        torch.where(valid, (before - now) / frame.unit, 0.0)
+        for before, now in zip(held.origin, frame.origin, strict=True)
+    )
+    same = torch.where(valid, grown * grown - 1, 0.0)
+    norm = (
+        same, zero, zero, grown * b0,
+        same, zero, grown * b1,
+        same, grown * b2,
+        b0 * b0 + b1 * b1 + b2 * b2,
+    )  # fmt: skip
+    mu = dot(x, multiply(matrix, x)) / (1 + dot(x, multiply(norm, x)))
+    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
+        less(entry, mu, part) for entry, part in zip(matrix, norm, strict=True)
+    )
+    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
 
 
 def in_world(points: Vector3, datum: Tensor) -> Vector3:

@@ -102,8 +102,9 @@ def pose_tracks(
     )
     frame = rig_frame(*sums, eps=torch.finfo(proj.dtype).eps)
     frame = frame._replace(finite=frame.finite & listed.weights.sound)
-    origin = at(torch.stack(frame.origin), point_index) + datum.mT
-    unit = at(frame.unit, point_index)
+    held = frame.held()
+    origin = at(torch.stack(held.origin), point_index) + datum.mT
+    unit = at(held.unit, point_index)
     moved = ((listed.camera[:, :3] * origin).sum(dim=1) + listed.camera[:, 3]) / unit
     p1, p2, p3 = torch.cat([listed.camera[:, :3], moved[:, None]], dim=1)  # each (4, T)
     rows = listed.x * p3 - p1, listed.y * p3 - p2

@@ -14,6 +14,7 @@ from triangulation_cases import noisy
 from deltas_geom import PosedViews, Status, triangulate, triangulate_points
 from deltas_geom.numerics import sums
 from deltas_geom.testing import forward_motion, rigid
+from deltas_geom.testing.fixed_scenes import seeded_scene
 from deltas_geom.testing.strategies import vectors
 from deltas_geom.triangulation import triangulate as dispatch
 
@@ -236,3 +237,22 @@ def test_a_pixel_that_is_not_finite_fails_alone_however_points_are_cut(
     assert (found.status[failing] == Status.NOT_FINITE_INPUT).all()
     sound = found.valid.nonzero().flatten()
     assert_close(found.points[sound], scene.points.repeat(7000, 1)[sound], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("tiny", [1e-2, 1e-4, 1e-5])
+@pytest.mark.parametrize("views", [2, 3])
+def test_where_one_view_outweighs_all_others_what_is_derived_is_the_adjoint(
+    views: int, tiny: float
+) -> None:
+    scene = seeded_scene(3, num_views=views, num_points=6, noise=1.0)
+    weights = torch.ones(views, 6).double()
+    weights[1:] = tiny
+    inputs = [x.clone().requires_grad_() for x in (scene.views.proj, scene.pixels, weights)]
+    points = triangulate_points(*inputs).sum()
+    adjoint = torch.autograd.grad(points, inputs, retain_graph=True)
+    derived = torch.autograd.grad(points, inputs, create_graph=True)
+    # What the squares of rows lose of a small weight's digits.
+    lost = 1e-13 / tiny**2
+    for ours, theirs in zip(derived, adjoint, strict=True):
+        assert_close(ours, theirs, rtol=0, atol=lost * (1 + float(theirs.abs().max())))
+    assert_close(derived[2][1:], adjoint[2][1:], rtol=0.05, atol=1e-8)
