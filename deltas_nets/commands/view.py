@@ -15,9 +15,9 @@ from deltas_nets.errors import UserError
 
 @dataclass(frozen=True)
 class View(Command):
-    """Show a capture in three dimensions: cameras, sparse points and, of DEPTHS, what was found.
+    """Show a capture in the browser: cameras, points and, of DEPTHS, what was found.
 
-    A browser shows cameras with their images, the points of the depth maps above a confidence that
+    It shows cameras with their images, the points of the depth maps above a confidence that
     can be moved, the mesh and the cloud of `deltas fuse`, and the points that the capture's own
     program triangulated. It needs the extra "view". Ctrl-C ends it.
 

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -68,7 +69,10 @@ def test_a_camera_sees_what_its_outline_holds(make_capture: MakeCapture) -> None
 
 def test_the_page_holds_every_map_and_needs_nothing_else(filled: tuple[Path, Path]) -> None:
     capture, folder = filled
+    (folder / "preview").mkdir()
+    (folder / "preview" / ".1.jpg.0a1b2c3d.deltas-tmp").write_bytes(b"half")
     page = page_of(capture, folder)
+    assert sorted(os.listdir(folder / "preview")) == ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
     assert (page.maps, page.shown) == (4, 4) and page.size == page.path.stat().st_size
     text = page.path.read_text(encoding="utf-8")
     assert not re.search(r"https?:|//cdn|@import|url\(|<link|\bsrc=", text)
