@@ -63,14 +63,32 @@ def recorded_depth_scale(out: Path) -> float:
     return scale
 
 
+OPTIONS = {
+    "capture": "the capture (its path or a camera)",
+    "network": "--weights",
+    "weights": "--weights",
+    "view_sets": "--view-sets (a file's or chosen ones)",
+}
+"""What states a setting; of the others an option of the same name does."""
+
+
 def difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """The settings that differ, as the user would say it: ``views was 3, is 5``."""
-    before = earlier["settings"]
-    names = sorted(before.keys() | wanted.keys())
-    changed = [name for name in names if before.get(name) != wanted.get(name)]
-    words = []
-    for name in changed[:3]:
-        was, now = json.dumps(before.get(name)), json.dumps(wanted.get(name))
+    """The settings that differ, by the options that state them: ``--views was 3, is 5``."""
+    before, after = _flat(earlier["settings"]), _flat(wanted)
+    names = sorted(before.keys() | after.keys())
+    words: dict[str, str] = {}
+    for name in (name for name in names if before.get(name) != after.get(name)):
+        option = OPTIONS.get(name, f"--{name.replace('_', '-')}")
+        was, now = json.dumps(before.get(name)), json.dumps(after.get(name))
         short = len(was) + len(now) < 60
-        words.append(f"{name} was {was}, is {now}" if short else f"{name} differs")
-    return "; ".join(words) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+        words.setdefault(option, f"was {was}, is {now}" if short else "differs")
+    said = [f"{option} {what}" for option, what in words.items()]
+    return "; ".join(said[:3]) + (f" and {len(said) - 3} more" if len(said) > 3 else "")
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings, those of the prediction among them."""
+    inner = settings.get("predict")
+    if not isinstance(inner, dict):
+        return dict(settings)
+    return {**{name: value for name, value in settings.items() if name != "predict"}, **inner}

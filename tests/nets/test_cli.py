@@ -179,7 +179,7 @@ def test_another_scale_is_known_to_who_reads_the_maps(depth: DepthCommand, tmp_p
         errors.append(scores["metrics"]["dense"]["abs_rel"])
     assert errors[0] == pytest.approx(errors[1], abs=0.002)  # half a centimetre at 2.5 m
     assert "depth_scale" not in depth.summary()["settings"]  # as before there was another scale
-    assert_one_line(depth("--depth-scale", 100), "depth_scale was null, is 100.0")
+    assert_one_line(depth("--depth-scale", 100), "--depth-scale was null, is 100.0")
 
 
 def test_depth_beyond_the_file_is_a_warning(

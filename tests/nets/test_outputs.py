@@ -214,7 +214,7 @@ def test_other_settings_are_an_error_that_names_them(tmp_path: Path) -> None:
     with pytest.raises(UserError) as error:
         prepare_output(tmp_path, settings=SETTINGS | {"views": 5})
     assert error.value.where == tmp_path / "summary.json"
-    assert "views was 3, is 5" in error.value.what and "--overwrite" in error.value.remedy
+    assert "--views was 3, is 5" in error.value.what and "--overwrite" in error.value.remedy
     assert files_in(tmp_path) == before
 
 
