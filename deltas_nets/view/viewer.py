@@ -74,6 +74,65 @@ def open_viewer(
     centres = np.array([camera.world_from_cam[:3, 3] for camera in cameras])
     # Browsers compute in float32: what is shown is around the middle of the cameras.
     origin = np.median(centres, axis=0)
+    fused: list[Layer] = []
+    points = None
+    if maps is not None:
+        fused = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
+        points = _fewer(points_of_maps(maps))
+        points = points if len(points.confidence) else None
+    sparse = sparse_layer(capture, MOST_POINTS)
+    clouds = [layer.surface.xyz for layer in fused]
+    clouds += [] if points is None else [points.surface.xyz]
+    clouds += [] if sparse is None else [sparse.surface.xyz]
+
+    from viser import ViserServer
+
+
+__all__ = ["check_extra", "open_viewer"]
+
+MOST_POINTS, MOST_FACES = 400_000, 400_000
+MOST_IMAGES, IMAGE_LONGEST = 200, 160
+"""Frames whose images are shown, and pixels of their longer side."""
+SMALLEST = 1e-6
+CAMERA_BLUE = (86, 138, 242)
+
+
+def check_extra() -> None:
+    """Is the package installed that the viewer needs?
+
+    Raises:
+        UserError: it is not.
+    """
+    if find_spec("viser") is None:
+        remedy = 'pip install "deltas-depth[view]"'
+        raise UserError("the viewer needs the package viser", "deltas view", remedy)
+
+
+def open_viewer(
+    capture: Capture, maps: Maps | None, *, host: str = "127.0.0.1", port: int = 8080
+) -> "ViserServer":
+    """Serve a capture: its cameras and sparse points and, of maps, their points and what was fused.
+
+    Args:
+        capture: the frames.
+        maps: what `deltas depth` wrote of it, in which case ``maps.capture`` is shown.
+        host: who may look: this machine alone, or 0.0.0.0 for all.
+        port: where; the next one that is free if it is not.
+
+    Returns:
+        The server, which works until it is stopped.
+
+    Raises:
+        UserError: viser is not installed, or a file cannot be read.
+    """
+    check_extra()
+    if maps is not None:
+        capture = maps.capture
+    shown = capture.frames if maps is None else maps.ids
+    cameras = [camera_of(capture.frame(id)) for id in shown]
+    centres = np.array([camera.world_from_cam[:3, 3] for camera in cameras])
+    # Browsers compute in float32: what is shown is around the middle of the cameras.
+    origin = np.median(centres, axis=0)
     layers, points = [], None
     if maps is not None:
         layers = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
@@ -85,14 +144,17 @@ def open_viewer(
 
     with redirect_stdout(io.StringIO()):  # it has a banner of its own
         server = ViserServer(host=host, port=port, label=capture.path.resolve().name, verbose=False)
-    box = _box(centres, layers, points) - origin
+    box = _box([*clouds, centres]) - origin
     reach = max(float(np.linalg.norm(box[1] - box[0])), SMALLEST)
     _look(server, up_of(capture), cameras, box, reach)
     server.gui.add_markdown(_words(capture, maps))
-    for place, layer in enumerate(layers):
-        _show(server, layer, origin, reach, shown=place == 0)
-    if points is not None and len(points.confidence):
-        _show_points_of_maps(server, points, origin, reach, shown=not layers)
+    # One thing is shown at first: a mesh, else points of the maps, else what the capture has.
+    for layer in fused:
+        _show(server, layer, origin, reach, shown=layer is fused[0])
+    if points is not None:
+        _show_points_of_maps(server, points, origin, reach, shown=not fused)
+    if sparse is not None:
+        _show(server, sparse, origin, reach, shown=not fused and points is None)
     _show_cameras(server, capture, cameras, origin, reach)
     return server
 
@@ -113,12 +175,9 @@ def _fewer(points: SurePoints) -> SurePoints:
     )
 
 
-def _box(centres: FloatArray, layers: list[Layer], points: SurePoints | None) -> FloatArray:
+def _box(clouds: list[NDArray[np.float64]]) -> FloatArray:
     """``(2, 3)`` corners of a box around most of what there is."""
-    clouds = [layer.surface.xyz for layer in layers]
-    if points is not None:
-        clouds.append(points.surface.xyz)
-    boxes = [np.percentile(xyz, (5, 95), axis=0) for xyz in [*clouds, centres] if len(xyz)]
+    boxes = [np.percentile(xyz, (5, 95), axis=0) for xyz in clouds]
     return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
 
 
