@@ -87,61 +87,6 @@ def open_viewer(
 
     from viser import ViserServer
 
-
-__all__ = ["check_extra", "open_viewer"]
-
-MOST_POINTS, MOST_FACES = 400_000, 400_000
-MOST_IMAGES, IMAGE_LONGEST = 200, 160
-"""Frames whose images are shown, and pixels of their longer side."""
-SMALLEST = 1e-6
-CAMERA_BLUE = (86, 138, 242)
-
-
-def check_extra() -> None:
-    """Is the package installed that the viewer needs?
-
-    Raises:
-        UserError: it is not.
-    """
-    if find_spec("viser") is None:
-        remedy = 'pip install "deltas-depth[view]"'
-        raise UserError("the viewer needs the package viser", "deltas view", remedy)
-
-
-def open_viewer(
-    capture: Capture, maps: Maps | None, *, host: str = "127.0.0.1", port: int = 8080
-) -> "ViserServer":
-    """Serve a capture: its cameras and sparse points and, of maps, their points and what was fused.
-
-    Args:
-        capture: the frames.
-        maps: what `deltas depth` wrote of it, in which case ``maps.capture`` is shown.
-        host: who may look: this machine alone, or 0.0.0.0 for all.
-        port: where; the next one that is free if it is not.
-
-    Returns:
-        The server, which works until it is stopped.
-
-    Raises:
-        UserError: viser is not installed, or a file cannot be read.
-    """
-    check_extra()
-    if maps is not None:
-        capture = maps.capture
-    shown = capture.frames if maps is None else maps.ids
-    cameras = [camera_of(capture.frame(id)) for id in shown]
-    centres = np.array([camera.world_from_cam[:3, 3] for camera in cameras])
-    # Browsers compute in float32: what is shown is around the middle of the cameras.
-    origin = np.median(centres, axis=0)
-    layers, points = [], None
-    if maps is not None:
-        layers = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
-        points = _fewer(points_of_maps(maps))
-    sparse = sparse_layer(capture, MOST_POINTS)
-    layers += [] if sparse is None else [sparse]
-
-    from viser import ViserServer
-
     with redirect_stdout(io.StringIO()):  # it has a banner of its own
         server = ViserServer(host=host, port=port, label=capture.path.resolve().name, verbose=False)
     box = _box([*clouds, centres]) - origin
