@@ -8,7 +8,7 @@ from refinement_cases import LOSSES, SCALE, near_misses, robust_cost, scene_at
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom import ShapeError, refine_points, reprojection_residual
+from deltas_geom import ShapeError, project, refine_points, reprojection_residual
 from deltas_geom.testing import PosedScene, forward_motion
 from deltas_geom.testing.strategies import posed_scenes, vectors
 from deltas_geom.triangulation.refine import Loss
@@ -101,3 +101,16 @@ def test_what_cannot_be_refined_comes_back(dtype: torch.dtype) -> None:
     for gradient in (gradients[1], gradients[3]):
         assert (gradient[:, failed] == 0).all() and (gradient[:, 5] != 0).any()
     assert (gradients[2][failed] == 0).all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_without_steps_points_are_judged_where_they_are(loss: Loss) -> None:
+    scene = forward_motion()
+    points = torch.tensor([[0.1, 0.2, 3.0], [0.1, 0.1, -2.0], [0.0, 0.2, 0.1], [0.0, 0.1, 0.4]])
+    points = points.to(scene.points)
+    in_front = project(scene.views, points).in_front.all(dim=0)
+    assert 0 < in_front.sum() < 4
+    pixels = scene.pixels[:, :1].expand(-1, 4, -1)
+    judged = refine_points(scene.views.proj, pixels, points, steps=0, loss=loss, scale=SCALE)
+    assert torch.equal(judged.valid, in_front)
+    assert torch.equal(judged.points, points)

@@ -17,6 +17,7 @@ from deltas_geom import (
     triangulate_robust,
 )
 from deltas_geom.testing import PosedScene, ring, scene_from
+from deltas_geom.testing.fixed_scenes import seeded_scene
 from deltas_geom.testing.strategies import posed_scenes, vectors
 
 NOISE = 0.5  # px, so that all views are within the default threshold of 4 px
@@ -201,6 +202,18 @@ def test_a_threshold_is_a_distance_in_pixels(drawn: tuple[PosedScene, Tensor], o
                 scene.views.proj, some, threshold=factor * float(distance[point])
             )
             assert found.valid.item() == (factor > 1)
+
+
+@pytest.mark.parametrize("num_views", [3, 4])
+def test_inliers_are_within_the_threshold_of_the_point_returned(num_views: int) -> None:
+    # Noise as large as that, and weights that draw the point of those who agree to one of them.
+    scene = seeded_scene(3, num_views=num_views, num_points=300, noise=4.0)
+    generator = torch.Generator().manual_seed(0)
+    weights = 10 ** (-3 * torch.rand(num_views, 300, generator=generator).double())
+    found = triangulate_robust(scene.views.proj, scene.pixels, weights, threshold=4.0)
+    assert (found.errors[found.inliers] < 4).all()
+    assert torch.equal(found.valid, found.inliers.any(dim=0))
+    assert 0.9 < found.valid.double().mean() < 1  # others are refused
 
 
 def test_a_heavy_view_is_rejected_last() -> None:
