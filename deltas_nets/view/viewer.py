@@ -74,6 +74,7 @@ def open_viewer(
     centres = np.array([camera.world_from_cam[:3, 3] for camera in cameras])
     # Browsers compute in float32: what is shown is around the middle of the cameras.
     origin = np.median(centres, axis=0)
+    images = _images(capture, [camera.id for camera in cameras])
     fused: list[Layer] = []
     points = None
     if maps is not None:
@@ -100,8 +101,14 @@ def open_viewer(
         _show_points_of_maps(server, points, origin, reach, shown=not fused)
     if sparse is not None:
         _show(server, sparse, origin, reach, shown=not fused and points is None)
-    _show_cameras(server, capture, cameras, origin, reach)
+    _show_cameras(server, cameras, images, origin, reach)
     return server
+
+
+def _images(capture: Capture, ids: list[str]) -> dict[str, NDArray[np.uint8]]:
+    """Small images of some frames."""
+    frames = map(capture.frame, spread(ids, MOST_IMAGES))
+    return {f.id: f.read_resized(size_within(f.image_size, IMAGE_LONGEST)) for f in frames}
 
 
 def _words(capture: Capture, maps: Maps | None) -> str:
@@ -207,8 +214,8 @@ def _show_points_of_maps(
 
 def _show_cameras(
     server: "ViserServer",
-    capture: Capture,
     cameras: list[Camera],
+    images: dict[str, NDArray[np.uint8]],
     origin: FloatArray,
     reach: float,
 ) -> None:
@@ -216,12 +223,9 @@ def _show_cameras(
     from viser.transforms import SO3
 
     told: Any = server.gui.add_text("frame", "click a camera", disabled=True)
-    with_images = set(spread([camera.id for camera in cameras], MOST_IMAGES))
     handles = []
     for number, camera in enumerate(cameras):
         left, top, right, bottom = camera.slopes
-        size = size_within(capture.frame(camera.id).image_size, IMAGE_LONGEST)
-        shown = camera.id in with_images
         # By number: an id may hold slashes, which stand for parents here.
         handle = server.scene.add_camera_frustum(
             f"/cameras/{number}",
@@ -231,7 +235,7 @@ def _show_cameras(
             thickness=1.5,
             thickness_units="screen",
             color=CAMERA_BLUE,
-            image=capture.frame(camera.id).read_resized(size) if shown else None,
+            image=images.get(camera.id),
             wxyz=SO3.from_matrix(camera.world_from_cam[:3, :3]).wxyz,
             position=camera.world_from_cam[:3, 3] - origin,
         )
