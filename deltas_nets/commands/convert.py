@@ -1,6 +1,6 @@
 """The command `deltas convert`."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -40,6 +40,12 @@ class Convert(Command):
     scale_from: Annotated[Path | None, tyro.conf.arg(metavar="sensor|FILE")] = None
     """Find that length by its sensor depth, which is in metres, or by a file of measured depths:
     lines ID X Y METRES."""
+    depths: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Maps that deltas depth made of this capture: they go along as its depth, where the format has
+    a place, and confident points of them, with tracks, become its sparse points: what splatting
+    starts from."""
+    points: int = 100_000
+    """With --depths: how many points, about."""
     intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
     """Of all images, in quotes: fx fy cx cy and, of a lens, k1 k2 p1 p2 k3; or freiburg1."""
     debug: Flag = False
@@ -50,6 +56,8 @@ class Convert(Command):
         from deltas_nets.captures.new_folder import check_new
 
         check_new(self.out)
+        if self.points < 1:
+            raise UserError("too few points", f"--points {self.points}", "give 1 or more")
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
 
@@ -61,6 +69,15 @@ class Convert(Command):
 
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         capture = self._in_metres(open_capture(self.capture, intrinsics=stated))
+        if self.depths is not None:
+            from deltas_nets.fuse.seeds import seeds, with_maps
+            from deltas_nets.fuse.sources import depth_source
+
+            source = depth_source(capture, self.depths)
+            with progress("points", len(source.ids)) as report:
+                found = seeds(source, self.points, report=report)
+            capture = replace(with_maps(source.capture, self.depths), points=found)
+            print(f"{len(found.xyz)} points that two maps or more agree on")
         with progress("writing", len(capture.frames)) as report:
             left_out = save_capture(capture, self.out, self.to, placing=self.images, report=report)
         for doubt in (*capture.doubts, *left_out):

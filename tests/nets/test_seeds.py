@@ -1,0 +1,81 @@
+"""Confident points of depth maps, with tracks: as COLMAP itself would have them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import MakeCapture
+from run_command import Run, assert_one_line
+from small_maps import write_maps
+
+from deltas_nets.captures.opening import open_capture
+
+SIZE = (48, 64)
+
+
+@pytest.fixture
+def capture(make_capture: MakeCapture) -> Path:
+    return make_capture()  # four frames, a wall at 2.5 m
+
+
+def wall(size: tuple[int, int]) -> np.ndarray:
+    return np.full(size, 2.5)
+
+
+@pytest.mark.parametrize("to", ["colmap", "colmap-bin"])
+def test_a_model_has_our_points_with_tracks(
+    run: Run, capture: Path, tmp_path: Path, to: str
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    maps = write_maps(capture, tmp_path / "maps", depth=wall)
+    out = tmp_path / "model"
+    said = run("convert", capture, out, "--to", to, "--depths", maps, "--points", 200)
+    assert said.code == 0, said.err
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    assert 100 < len(model.points3D) <= 260
+    for point in model.points3D.values():
+        assert point.xyz[2] == pytest.approx(2.5, abs=1e-3)
+        assert point.track.length() >= 2 and 0 <= point.error < 0.1
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen = image.points2D[element.point2D_idx].xy
+            assert image.project_point(point.xyz) == pytest.approx(seen, abs=1e-3)
+            assert (seen >= 0).all() and (seen <= SIZE[::-1]).all()
+    seen_by = [sum(p.has_point3D() for p in image.points2D) for image in model.images.values()]
+    assert min(seen_by) > 50
+
+
+def test_maps_go_along_as_depth(run: Run, capture: Path, tmp_path: Path) -> None:
+    maps = write_maps(capture, tmp_path / "maps", depth=wall)
+    out = tmp_path / "nerf"
+    flags = ("--to", "transforms", "--depths", maps, "--points", 50)
+    assert run("convert", capture, out, *flags).code == 0
+    written = open_capture(out)
+    assert written.points is not None and len(written.points.xyz) >= 25
+    for frame in written.frames.values():
+        assert frame.depth_path is not None and out in frame.depth_path.parents
+        assert np.abs(frame.read_depth() - 2.5).max() < 1e-3
+
+
+def test_what_no_other_map_confirms_is_no_point(run: Run, capture: Path, tmp_path: Path) -> None:
+    wrong = iter([1.0, 2.0, 4.0, 8.0])
+
+    def half_true(size: tuple[int, int]) -> np.ndarray:
+        depth = np.full(size, 2.5)
+        depth[: size[0] // 2] = next(wrong)
+        return depth
+
+    maps = write_maps(capture, tmp_path / "maps", depth=half_true)
+    assert run("convert", capture, tmp_path / "out", "--depths", maps, "--points", 400).code == 0
+    points = open_capture(tmp_path / "out").points
+    assert points is not None
+    assert (points.xyz[:, 1] > 0).all()  # the lower half of the images
+
+
+def test_without_agreement_it_is_said(run: Run, capture: Path, tmp_path: Path) -> None:
+    depths = iter([1.0, 2.0, 4.0, 8.0])
+    maps = write_maps(capture, tmp_path / "maps", depth=lambda size: np.full(size, next(depths)))
+    said = run("convert", capture, tmp_path / "out", "--depths", maps)
+    assert_one_line(said, "no two maps agree")
+    assert not (tmp_path / "out").exists()
+    assert_one_line(run("convert", capture, tmp_path / "out", "--points", 0), "--points 0")
