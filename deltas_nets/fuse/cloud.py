@@ -118,12 +118,11 @@ def normals_of(points: Tensor) -> tuple[Tensor, Tensor]:
     known = points[..., 2] > 0
     across, has_across = _slope(points, known, dim=1)
     down, has_down = _slope(points, known, dim=0)
+    # Points are depths times rays, so this product looks at the camera whatever the depths are.
     normals = torch.linalg.cross(down, across)
     length = torch.linalg.vector_norm(normals, dim=-1)
     valid = known & has_across & has_down & (length > 0)
-    normals = normals / torch.where(valid, length, 1.0)[..., None]
-    away = (normals * points).sum(dim=-1, keepdim=True) > 0
-    return torch.where(away, -normals, normals), valid
+    return normals / torch.where(valid, length, 1.0)[..., None], valid
 
 
 def _slope(points: Tensor, known: Tensor, dim: int) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ TOLERANCE = 0.05
 STEPS = 255
 UNSTATED = 0.05
 """Relative deviation of maps that state none: all weigh alike then, but for their distance."""
-OF_SENSORS = 0.01
+OF_SENSORS = 0.02
 """Relative deviation of sensor depth: structured light and time of flight at a few metres."""
 
 

@@ -155,8 +155,8 @@ class _Seen:
         pixel = row.clamp_(0, self.height - 1).int().mul_(self.width).add_(column).reshape(-1)
         depth = self.depth.index_select(0, pixel).view_as(z)
         distance = (depth - z).mul_(1 / truncation)
-        # In front of the truncation a map says nothing either: one that sees through a surface would
-        # outvote many that see it.
+        # Nothing is said in front of the truncation either: a map that sees through a surface
+        # would outvote many that see it.
         seen = ((distance.abs() < 1) & (depth > 0) & (z > NEAREST)).float()
         weight = self.weight.index_select(0, pixel).view_as(z).mul_(seen)
         slab[0].index_add_(0, slots, weight)

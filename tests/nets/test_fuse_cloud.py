@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fused_scenes import SIZE, sphere_views, view_of, wall
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
@@ -18,6 +18,7 @@ SPHERE = sphere_views()
 FAR = (4e5, 5e6, 200.0)  # metres, as of a survey
 
 
+@settings(max_examples=10)
 @given(slopes=st.tuples(st.floats(-1, 1), st.floats(-1, 1)))
 def test_normals_of_a_plane_are_its_normal(slopes: tuple[float, float]) -> None:
     # Points with z = 2 + a x + b y; normals point against z, at the camera.
