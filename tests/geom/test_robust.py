@@ -213,7 +213,7 @@ def test_inliers_are_within_the_threshold_of_the_point_returned(num_views: int) 
     found = triangulate_robust(scene.views.proj, scene.pixels, weights, threshold=4.0)
     assert (found.errors[found.inliers] < 4).all()
     assert torch.equal(found.valid, found.inliers.any(dim=0))
-    assert 0.9 < found.valid.double().mean() < 1  # others are refused
+    assert 0.8 < found.valid.double().mean() < 1  # others are refused
 
 
 def test_a_heavy_view_is_rejected_last() -> None:

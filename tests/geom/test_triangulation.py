@@ -15,6 +15,7 @@ from deltas_geom import (
     Status,
     camera_centers,
     point_covariance,
+    project,
     ray_parallax,
     reprojection_residual,
     triangulate,
@@ -25,6 +26,7 @@ from deltas_geom.testing import (
     default_intrinsics,
     forward_motion,
     right_angle,
+    rigid,
     ring,
     scene_from,
 )
@@ -173,6 +175,20 @@ def test_unequal_weights_do_not_send_a_near_point_to_infinity(dtype: torch.dtype
     result = triangulate(scene.views.proj, scene.pixels, weights)
     assert (result.status == Status.OK).all()
     assert_close(result.points, scene.points, rtol=0, atol=1e-4)  # m
+
+
+def test_two_cameras_in_one_place_have_no_baseline_wherever_the_others_stand() -> None:
+    turn = torch.tensor([[0.0, 0, 0], [0, 0.1, 0], [0, 0, 0], [0.1, 0, 0], [0, 0, 0.1]]).double()
+    centers = torch.tensor([[3.0, 0, 0], [3, 0, 0], [0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]).double()
+    pose = rigid(turn, torch.zeros(5, 3).double())
+    pose[:, :3, 3:] = -pose[:, :3, :3] @ centers[..., None]
+    views = PosedViews(default_intrinsics().expand(5, 3, 3).double(), pose)
+    points = torch.tensor([[0.2, 0.1, 5.0], [1.0, -0.3, 8.0]]).double()
+    off = torch.tensor([[0.0, 0.0], [0.5, -0.5]]).double()
+    pixels = project(views, points).pixels + off[:, None].repeat(3, 1, 1)[:5]
+    mask = torch.tensor([True, True, False, False, False])[:, None].expand(5, 2)
+    found = triangulate(views.proj, pixels, mask=mask)
+    assert (found.status == Status.NO_PARALLAX).all()
 
 
 def test_every_status_explains_itself() -> None:
