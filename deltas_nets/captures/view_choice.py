@@ -30,6 +30,9 @@ MIN_OVERLAP = 0.4
 MAX_ANGLE = np.radians(45)
 GOOD_ANGLE = np.radians(15)  # where the penalty of the viewing angle reaches exp(-1/2)
 NEAREST = 0.04  # in working depths; what is nearer to a candidate does not count as seen
+COVERAGE = 6.0
+"""How much a source gains by the log of the part of the anchor that is seen with it, by the part
+that is seen without."""
 MAX_CANDIDATES = 48  # frames scored by projection for each anchor
 
 
@@ -100,17 +103,17 @@ def choose_views(
         anchor = index_of[id]
         depth = float(depths[anchor]) if depths is not None else working_depth or 0.0
         near = _candidates(centres, poses[:, 2, :3], anchor, depth)
-        overlap = _overlap(capture, anchor, near, depth)
+        seen = _seen_probes(capture, anchor, near, depth)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
         angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
-        log_score, hindered = _rate(offsets, angles, overlap, depth)
+        log_score, hindered = _rate(offsets, angles, seen.mean(axis=-1), depth)
         acceptable = hindered == ""
         if acceptable.sum() < min(num_views, len(ids)) - 1:
             short[Counter(hindered[~acceptable]).most_common(1)[0][0]] += 1
         if acceptable.any():
             near, offsets = near[acceptable], offsets[acceptable]
-            log_score = log_score[acceptable]
-        chosen = spread_sources(log_score, offsets, num_views - 1)
+            log_score, seen = log_score[acceptable], seen[acceptable]
+        chosen = spread_sources(log_score, offsets, num_views - 1, seen=seen)
         view_sets.append(ViewSet(id, tuple(ids[near[index]] for index in chosen)))
     return ChosenViews(tuple(view_sets), dict(short.most_common()))
 
@@ -165,10 +168,10 @@ def _probes(capture: Capture, anchor: int, working_depth: float) -> FloatArray:
     return np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
 
 
-def _overlap(
+def _seen_probes(
     capture: Capture, anchor: int, near: NDArray[np.intp], working_depth: float
-) -> FloatArray:
-    """Part of what the anchor sees, at the probes, that each candidate sees, (C,)."""
+) -> NDArray[np.bool_]:
+    """Which of the anchor's probes each candidate sees, ``(C, P)``."""
     frames, points = capture.frames, _probes(capture, anchor, working_depth)
     poses = frames.cam_from_world
     rotation, shift = poses[anchor, :3, :3], poses[anchor, :3, 3:]
@@ -184,8 +187,8 @@ def _overlap(
     inside = (np.abs(column - (sizes[:, 1:] - 1) / 2) <= sizes[:, 1:] / 2) & (
         np.abs(row - (sizes[:, :1] - 1) / 2) <= sizes[:, :1] / 2
     )
-    part: FloatArray = (in_front & inside).mean(axis=-1)
-    return part
+    visible: NDArray[np.bool_] = in_front & inside
+    return visible
 
 
 def _rate(
@@ -211,16 +214,24 @@ def _rate(
     return score, hindered
 
 
-def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> list[int]:
+def spread_sources(
+    log_score: FloatArray,
+    offsets: FloatArray,
+    count: int,
+    *,
+    seen: NDArray[np.bool_] | None = None,
+) -> list[int]:
     """Choose the best one by one, each discounted by how nearly it repeats one that was chosen.
 
     A second view from the same place adds little; one from the opposite side sees what the
-    first cannot, and its errors differ.
+    first cannot, and its errors differ. What no source sees is guessed, so a view gains by what
+    those before it do not see: of a camera that walks ahead, a frame that is still near.
 
     Args:
         log_score: ``(C,)`` of the candidates, the more the better.
         offsets: ``(C, 3)`` metres from the anchor.
         count: how many are wanted.
+        seen: ``(C, P)`` which places that the anchor sees each candidate sees, if known.
 
     Returns:
         Indices of at most ``count`` candidates, best first.
@@ -230,9 +241,15 @@ def spread_sources(log_score: FloatArray, offsets: FloatArray, count: int) -> li
     repeated = np.zeros(len(log_score))
     left = log_score.copy()
     chosen: list[int] = []
+    covered = np.zeros(1 if seen is None else seen.shape[1], dtype=np.bool_)
+    gain = np.zeros(len(log_score))
     for _ in range(min(count, len(log_score))):
-        best = int(np.argmax(np.round(left - repeated, 9)))  # the first of equals
+        best = int(np.argmax(np.round(left - repeated + gain, 9)))  # the first of equals
         chosen.append(best)
+        if seen is not None:
+            covered = covered | seen[best]
+            part = np.maximum((covered | seen).mean(axis=-1), 1e-3)
+            gain = COVERAGE * np.log(part / max(float(covered.mean()), 1e-3))
         left[best] = -np.inf
         gap = np.linalg.norm(offsets - offsets[best], axis=-1) / lengths[best].clip(1e-9)
         alike = np.maximum(directions @ directions[best], 0.0) * np.exp(-gap)

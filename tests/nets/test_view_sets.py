@@ -115,6 +115,15 @@ def test_sources_lie_on_both_sides_of_the_anchor() -> None:
     assert len({int(source) < 2 for source in chosen.sources}) == 2
 
 
+def test_of_a_camera_that_walks_ahead_a_source_is_near_enough_to_see_what_the_anchor_sees() -> None:
+    steps = np.arange(20)
+    capture = row_of_cameras(np.stack([0.003 * steps**2, 0 * steps, 0.04 * steps], axis=-1))
+    (chosen,) = choose_view_sets(capture, 3, anchors=[0])
+    first, second = map(int, chosen.sources)
+    # By baseline alone the second would be farther than the first, and see less still.
+    assert second < first
+
+
 def test_a_camera_that_looks_elsewhere_is_not_chosen() -> None:
     centres = np.array([[0.0, 0, 0], [0.2, 0, 0], [-0.12, 0, 0]])
     capture = row_of_cameras(centres, turns=np.array([0.0, np.pi, 0.1]))
