@@ -10,6 +10,7 @@ from deltas_nets.network.known_depth import KnownDepth, as_points
 
 EDGE = 0.1
 """Range of log depth within two pixels: there the map itself knows best where things end."""
+PIXELS = 1 << 12
 MOST = 200
 """Places that tell how far the rest of the map is off."""
 
@@ -22,19 +23,19 @@ def agreed(own: KnownDepth, others: KnownDepth) -> KnownDepth:
         others: ``(V, 1, H, W)`` as the anchor sees them, see
             :func:`deltas_nets.agree.seen_from.seen_from`.
     """
-    depth = torch.cat([own.depth[None], others.depth])
-    deviation = torch.cat([own.deviation[None], others.deviation])
-    told = consensus(KnownDepth(depth, deviation))
+    everyone = zip(own, others, strict=True)
+    told = consensus(KnownDepth(*(torch.cat([mine[None], theirs]) for mine, theirs in everyone)))
     known = (told.depth > 0) & ~_edges(own.depth)
     if not known.any():
         return own
     points = as_points(KnownDepth(torch.where(known, told.depth, 0.0)[None], told.deviation[None]))
     log_depth = own.depth.log()
     process = correction(points, told.deviation[None].square(), log_depth[None], most=MOST)
-    moved = own.depth * _everywhere(process, log_depth).exp()
-    return KnownDepth(
-        torch.where(known, told.depth, moved), torch.where(known, told.deviation, own.deviation)
-    )
+    depth = torch.where(known, told.depth, own.depth).flatten()
+    left = (~known).flatten().nonzero()[:, 0]
+    depth[left] *= _correction_at(process, left, log_depth).exp()
+    deviation = torch.where(known, told.deviation, own.deviation)
+    return KnownDepth(depth.view(own.depth.shape), deviation)
 
 
 def _edges(depth: Tensor) -> Tensor:
@@ -44,10 +45,8 @@ def _edges(depth: Tensor) -> Tensor:
     return highest - lowest > EDGE
 
 
-def _everywhere(process: Correction, log_depth: Tensor) -> Tensor:
-    """The correction of all pixels ``(1, H, W)``, some rows at a time."""
-    index = torch.arange(log_depth.numel(), device=log_depth.device)
-    parts = [
-        process(Places.at(part[None], log_depth[None])) for part in torch.split(index, 1 << 14)
-    ]
-    return torch.cat(parts, dim=-1).reshape(log_depth.shape)
+def _correction_at(process: Correction, index: Tensor, log_depth: Tensor) -> Tensor:
+    """The correction ``(N,)`` at some pixels, not too many of them at a time."""
+    parts = torch.split(index, PIXELS)
+    found = [process(Places.at(part[None], log_depth[None]))[0] for part in parts]
+    return torch.cat(found) if found else log_depth.new_zeros(0)

@@ -1,6 +1,7 @@
 """What most of several depth maps say, pixel by pixel."""
 
 import torch
+from torch import Tensor
 
 from deltas_nets.network.known_depth import KnownDepth
 
@@ -8,6 +9,9 @@ LEAST = 3
 """Maps that must agree."""
 TOLERANCE = 0.08
 """By which the log of their depth may differ."""
+PIXELS = 1 << 13
+NOWHERE = 1e6
+"""Log depth of what is unknown."""
 
 
 def consensus(maps: KnownDepth) -> KnownDepth:
@@ -20,21 +24,31 @@ def consensus(maps: KnownDepth) -> KnownDepth:
         ``(1, H, W)``; unknown where fewer than `LEAST` agree. Maps of one network err together, so
         the deviation is not smaller than that of the mean map among them.
     """
-    known = maps.depth > 0
-    log_depth = torch.where(known, maps.depth, 1.0).log()
-    precision = torch.where(known, maps.deviation.clamp_min(0.01) ** -2, 0.0)
-    nothing = torch.zeros_like(log_depth[0])
-    best, mean, variance = nothing, nothing, nothing
-    for said, able in zip(log_depth, known, strict=True):
-        agree = known & able & ((log_depth - said).abs() < TOLERANCE)
-        share = precision * agree
-        total = share.sum(dim=0)
+    size = maps.depth.shape[1:]
+    depth, deviation = maps.depth.flatten(1), maps.deviation.flatten(1)
+    # Pixels some at a time: what is computed of them stays near the processor.
+    parts = zip(depth.split(PIXELS, dim=1), deviation.split(PIXELS, dim=1), strict=True)
+    found = [_of_pixels(*part) for part in parts]
+    return KnownDepth(*(torch.cat(columns).view(size) for columns in zip(*found, strict=True)))
+
+
+def _of_pixels(depth: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+    """The consensus ``(N,)`` of maps ``(V, N)``, and its deviation."""
+    known = depth > 0
+    # What is unknown agrees with nothing that is known.
+    log_depth = torch.where(known, depth.log(), NOWHERE)
+    precision = torch.where(known, deviation.clamp_min(0.01) ** -2, 0.0)
+    weighted = precision * log_depth
+    best, mean = torch.zeros_like(depth[0]), torch.zeros_like(depth[0])
+    for said in log_depth:
+        agree = (log_depth - said).abs_() < TOLERANCE
+        total = (precision * agree).sum(dim=0)
         better = (agree.sum(dim=0) >= LEAST) & (total > best)
-        share = share / total.clamp_min(1e-9)
-        middle = (share * log_depth).sum(dim=0)
-        spread = (share * (log_depth - middle).square()).sum(dim=0)
-        usual = agree.sum(dim=0) / total.clamp_min(1e-9)
         best = torch.where(better, total, best)
-        mean = torch.where(better, middle, mean)
-        variance = torch.where(better, usual + spread, variance)
-    return KnownDepth(torch.where(best > 0, mean.exp(), 0.0), variance.sqrt())
+        mean = torch.where(better, (weighted * agree).sum(dim=0) / total.clamp_min(1e-9), mean)
+    near = precision * ((log_depth - mean).abs() < TOLERANCE)
+    total = near.sum(dim=0).clamp_min(1e-9)
+    spread = (near * (log_depth - mean).square()).sum(dim=0) / total
+    usual = (near > 0).sum(dim=0) / total
+    found = best > 0
+    return torch.where(found, mean.exp(), 0.0), torch.where(found, (usual + spread).sqrt(), 0.0)
