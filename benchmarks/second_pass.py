@@ -1,9 +1,11 @@
 """Maps before and after they heard each other: error, error near edges of depth, flicker.
 
-    deltas depth CAPTURE --views 3 --format npz --passes 1 --out first
-    deltas depth CAPTURE --views 3 --format npz --out second
+    python benchmarks/second_pass.py sets CAPTURE 3 > sets.json
+    deltas depth CAPTURE --view-sets sets.json --format npz --no-page --passes 1 --out first
+    deltas depth CAPTURE --view-sets sets.json --format npz --no-page --out second
     python benchmarks/second_pass.py CAPTURE first second
 
+The sets are those of CAPTURE/view_sets.json where it has one, and chosen ones for all other frames.
 Scored are the anchors of CAPTURE/view_sets.json if there is one, else all maps. Edges are where the
 log of the true depth jumps by 0.1 between neighbours, and four pixels around. Flicker compares
 successive maps at places that both see, as the true depth has it (to 2 %): by how much the log of
@@ -25,6 +27,8 @@ from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets import open_capture
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.usable import usable_view_sets
+from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
 from deltas_nets.outputs.depth_formats import read_depth_map
@@ -35,6 +39,16 @@ SIZE = (270, 360)
 SAME = 0.02
 JUMP = 0.1
 Map = NDArray[np.float32]
+
+
+def sets() -> None:
+    """Write a view set of every frame to standard output."""
+    capture, views = open_capture(sys.argv[2]), int(sys.argv[3])
+    file = capture.path / "view_sets.json"
+    listed = usable_view_sets(capture, file, views).view_sets if file.exists() else ()
+    given = {chosen.anchor: chosen for chosen in listed}
+    all_sets = [given.get(v.anchor, v) for v in choose_view_sets(capture, views)]
+    print(json.dumps([{"anchor": v.anchor, "sources": v.sources} for v in all_sets]))
 
 
 def main() -> None:
@@ -127,4 +141,4 @@ def edges(depth: Map) -> NDArray[np.bool_]:
 
 
 if __name__ == "__main__":
-    main()
+    sets() if sys.argv[1] == "sets" else main()
