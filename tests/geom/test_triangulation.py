@@ -191,6 +191,18 @@ def test_two_cameras_in_one_place_have_no_baseline_wherever_the_others_stand() -
     assert (found.status == Status.NO_PARALLAX).all()
 
 
+def test_behind_one_camera_of_three_is_behind() -> None:
+    pose = torch.eye(4).double().repeat(3, 1, 1)
+    pose[1, 0, 3] = -0.3
+    pose[2] = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks back, from 1 m ahead
+    pose[2, 2, 3] = 1.0
+    proj = default_intrinsics().double() @ pose[:, :3]
+    points = torch.tensor([[0.1, 0.2, 3.0, 1.0], [0.1, 0.2, 0.5, 1.0]]).double()
+    seen = points @ proj.mT  # a line through the centre meets the image's plane on either side
+    found = triangulate(proj, seen[..., :2] / seen[..., 2:])
+    assert found.status.tolist() == [Status.BEHIND_CAMERA, Status.OK]
+
+
 def test_every_status_explains_itself() -> None:
     for status in Status:
         assert len(status.explanation.split()) >= 4
