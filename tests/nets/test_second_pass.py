@@ -1,6 +1,10 @@
 """`deltas depth` in two passes, by threads, killed and continued; and with measured depth."""
 
+import contextlib
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -128,3 +132,21 @@ def test_what_cannot_be_is_refused_before_anything_is_written(
 ) -> None:
     assert_one_line(depth("out", *flags), *parts)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_ten_kills_at_random_change_nothing(depth: Any, scene: Path, tmp_path: Path) -> None:
+    fixed = ["--format", "npz", "--no-page", "--views", "3", "--work-size", "64", "96"]
+    command = [sys.executable, "-m", "deltas_nets.cli", "depth", str(scene), *fixed, "--out"]
+    began = time.monotonic()
+    subprocess.run([*command, str(tmp_path / "whole")], check=True)
+    whole, random = time.monotonic() - began, np.random.default_rng(0)
+    for _ in range(10):
+        process = subprocess.Popen([*command, str(tmp_path / "killed")])
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(random.uniform(0.3, 1.0) * whole)
+        process.kill()
+        process.wait()
+    subprocess.run([*command, str(tmp_path / "killed")], check=True)
+    assert not (tmp_path / "killed" / FIRST).exists()
+    assert np.allclose(maps(tmp_path / "killed"), maps(tmp_path / "whole"), rtol=1e-5)
