@@ -47,9 +47,9 @@ class Fuse(Command):
     """Write mesh.ply."""
     glb: Flag = False
     """Write mesh.glb, for browsers and Blender (extra mesh)."""
-    voxel: float | None = None
+    voxel: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
     """Side of a voxel in the capture's unit; from the deviation of the maps if not given."""
-    min_confidence: float | None = None
+    min_confidence: Annotated[float | None, tyro.conf.arg(metavar="P")] = None
     """Leave out pixels of less confidence, 0 to 1; 0.3 if not given."""
     consistency: Flag = True
     """Do not compare maps with each other: all depth counts."""
