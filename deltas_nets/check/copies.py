@@ -41,8 +41,8 @@ def repeated(capture: Capture, groups: list[list[str]], how: str) -> list[Findin
         for id in ids[1:]
     )
     pairs = "; ".join(f"{ids[1]} is {ids[0]}" for ids in groups[:3])
-    evidence = f"{len(copies)} images are copies of another frame's ({how}; {pairs}), "
-    evidence += f"{differ} of them with another pose"
+    evidence = f"{len(copies)} of {len(order)} images repeat another frame's ({how}; {pairs}), "
+    evidence += f"{differ} with another pose"
     cure = f"leave out {ids_in_words(copies, 20)}"
     return [
         Finding(

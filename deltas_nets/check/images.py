@@ -53,7 +53,8 @@ def look_at_images(capture: Capture) -> list[Finding]:
     found: list[Finding] = []
     if broken:
         first = next(iter(broken))
-        what = f"{len(broken)} images cannot be decoded ({first}: {broken[first]})"
+        looked = len(seen) + len(broken)
+        what = f"{len(broken)} of {looked} images cannot be decoded ({first}: {broken[first]})"
         cure = f"copy them again, or leave out {ids_in_words(broken, 20)}"
         mend = leaving_out(tuple(broken))
         found = [Finding(Fault.IMAGES_UNREADABLE, what, tuple(broken), cure, "error", mend)]

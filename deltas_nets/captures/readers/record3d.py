@@ -51,7 +51,7 @@ def read(path: Path) -> Capture:
     doubts = []
     without = len(images.keys() - set(range(len(poses))))
     if without:
-        doubts.append(f"{without} images have no pose and are left out, {file}")
+        doubts.append(f"{without} of {len(images)} images have no pose and are left out, {file}")
     return found.capture(folder, "Record3D EXR", metric=True, doubts=doubts)
 
 
