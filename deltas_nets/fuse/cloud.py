@@ -73,8 +73,8 @@ class Cloud:
         )
         sums = torch.cat(values, dim=-1) * weight
         self._new.append(sums_by_name(names_of_cubes(corners.long()), sums))
-        # Merged when there is as much new as old: each sum is then merged a few times in all.
-        if sum(len(names) for names, _ in self._new) > len(self._names):
+        # Merged when there is half as much new as old: each sum is then merged a few times in all.
+        if 2 * sum(len(names) for names, _ in self._new) > len(self._names):
             self._merge()
 
     def points(self) -> CloudPoints:
