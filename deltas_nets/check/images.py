@@ -53,8 +53,8 @@ def look_at_images(capture: Capture) -> list[Finding]:
     found: list[Finding] = []
     if broken:
         first = next(iter(broken))
-        looked = len(seen) + len(broken)
-        what = f"{len(broken)} of {looked} images cannot be decoded ({first}: {broken[first]})"
+        total = len(seen) + len(broken)
+        what = f"{len(broken)} of {total} images cannot be decoded ({first}: {broken[first]})"
         cure = f"copy them again, or leave out {ids_in_words(broken, 20)}"
         mend = leaving_out(tuple(broken))
         found = [Finding(Fault.IMAGES_UNREADABLE, what, tuple(broken), cure, "error", mend)]

@@ -64,7 +64,7 @@ def recorded_depth_scale(out: Path) -> float:
 
 
 OPTIONS = {
-    "capture": "the capture (its path or a camera)",
+    "capture": "the capture or one of its cameras",
     "network": "--weights",
     "weights": "--weights",
     "view_sets": "--view-sets (a file's or chosen ones)",

@@ -126,10 +126,10 @@ def test_another_capture_with_the_same_ids_is_not_taken_for_finished(
     depth: DepthCommand, make_capture: MakeCapture, tmp_path: Path
 ) -> None:
     assert depth().code == 0
-    assert_one_line(depth(capture=make_capture(path=tmp_path / "two")), "capture differs")
+    assert_one_line(depth(capture=make_capture(path=tmp_path / "two")), "one of its cameras differs")
     file = depth.capture / "intrinsic" / "intrinsic_color.txt"
     file.write_text(file.read_text().replace("64.0", "60.0"))
-    assert_one_line(depth(), "capture differs")
+    assert_one_line(depth(), "one of its cameras differs")
 
 
 def test_overwriting_leaves_other_peoples_files(depth: DepthCommand) -> None:
