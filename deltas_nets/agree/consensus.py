@@ -27,7 +27,7 @@ def consensus(maps: KnownDepth) -> KnownDepth:
     size = maps.depth.shape[1:]
     depth, deviation = maps.depth.flatten(1), maps.deviation.flatten(1)
     # Pixels some at a time: what is computed of them stays near the processor.
-    parts = zip(depth.split(PIXELS, dim=1), deviation.split(PIXELS, dim=1), strict=True)
+    parts = zip(*(torch.split(part, PIXELS, dim=1) for part in (depth, deviation)), strict=True)
     found = [_of_pixels(*part) for part in parts]
     return KnownDepth(*(torch.cat(columns).view(size) for columns in zip(*found, strict=True)))
 

@@ -1,6 +1,7 @@
 """Maps of the first pass, kept until all are there: a folder of safetensors beside the outputs."""
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from deltas_nets.outputs.atomic_files import plain, write_atomically
 __all__ = ["FIRST", "FirstMaps"]
 
 FIRST = "first"
-"""The folder's name."""
+"""The folder's name, of a shard with its number."""
+PARTS = re.compile(rf"{FIRST}(\.\d+-of-\d+)?")
 
 
 class FirstMaps:
@@ -23,10 +25,13 @@ class FirstMaps:
 
     Args:
         out: the folder of outputs.
+        shard: of how many runs that fill it; each keeps its own maps, and hears no others: what
+            comes out must not depend on which of them is ahead.
     """
 
-    def __init__(self, out: Path) -> None:
-        self.folder = out / FIRST
+    def __init__(self, out: Path, shard: tuple[int, int] = (1, 1)) -> None:
+        part = "" if shard[1] == 1 else ".{}-of-{}".format(*shard)
+        self.folder = out / f"{FIRST}{part}"
 
     def file(self, id: str) -> Path:
         """Where the map of a frame lies."""
@@ -61,9 +66,20 @@ class FirstMaps:
         usable = (depth > 0) & (depth < torch.inf) & (deviation > 0) & (deviation < torch.inf)
         return KnownDepth(torch.where(usable, depth, 0.0), deviation), record
 
+    @staticmethod
+    def remove_all(out: Path) -> None:
+        """Remove those of all runs."""
+        for folder in out.glob(f"{FIRST}*"):
+            if folder.is_dir() and PARTS.fullmatch(folder.name):
+                _remove(folder)
+
     def remove(self) -> None:
         """Remove them; the outputs are there."""
-        for file in sorted(self.folder.rglob("*"), reverse=True):
-            file.unlink() if file.is_file() else file.rmdir()
-        if self.folder.is_dir():
-            self.folder.rmdir()
+        _remove(self.folder)
+
+
+def _remove(folder: Path) -> None:
+    for file in sorted(folder.rglob("*"), reverse=True):
+        file.unlink() if file.is_file() else file.rmdir()
+    if folder.is_dir():
+        folder.rmdir()

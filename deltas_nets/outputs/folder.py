@@ -25,6 +25,7 @@ from deltas_nets.outputs.atomic_files import (
     plain,
     write_json,
 )
+from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.journal import Journal, read_journals, remove_journals
 from deltas_nets.outputs.products import (
     PRODUCTS,
@@ -67,6 +68,8 @@ class OutputFolder:
         self._shard = shard
         own = path / SUMMARY if shard[1] == 1 else shard_summary(path, shard)
         self._journal = Journal(own)
+        self.first = FirstMaps(path, shard)
+        """Maps of the first pass, while there are two."""
         self._begun: dict[str, Any] = {}
         self._lock = Lock()
 
@@ -213,6 +216,8 @@ def prepare_output(
             _remove_frames(out, {*frame_ids, *(planned if shard[1] == 1 else ())})
             if shard[1] == 1:
                 _remove_shard_summaries(out)
+                FirstMaps.remove_all(out)
+            folder.first.remove()
         if shard[1] == 1:
             _remove_temporary(out)
         folder.write_summary("running")

@@ -13,7 +13,6 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.check.workers import side_by_side
-from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.folder import OutputFolder
 from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.outputs.verdict import Verdict, verdict
@@ -101,7 +100,7 @@ def predict_capture(
             kept when the same is asked for again.
     """
     search = search or Asked(capture, config.depth_range)
-    first = FirstMaps(folder.path)
+    first = folder.first
     twice = passes > 1 and predictor.states_confidence and len(view_sets) >= FEWEST
     kept = [views.anchor for views in view_sets if folder.is_finished(views.anchor)]
     for id in kept:

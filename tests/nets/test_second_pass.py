@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from run_command import Result, Run, assert_one_line
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.outputs.depth_formats import read_depth_map
 from deltas_nets.outputs.first_maps import FIRST, FirstMaps
 from deltas_nets.outputs.folder import OutputFolder
@@ -87,6 +89,11 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
     assert np.allclose(maps(tmp_path / "broken"), maps(tmp_path / "whole"), rtol=1e-5)
 
     assert not np.allclose(maps(tmp_path / "whole"), maps(tmp_path / "once"), rtol=1e-2)
+    # Another network's first maps are not taken for ours, and shards leave each other's alone.
+    left = FirstMaps(tmp_path / "broken", (2, 2))
+    left.write("0", KnownDepth(torch.ones(1, 4, 4), torch.ones(1, 4, 4)), {})
+    assert depth("broken", "--shard", "1/2", "--overwrite").code == 0 and left.has("0")
+    assert depth("broken", "--overwrite", "--passes", 1).code == 0 and not left.has("0")
     summary = json.loads((tmp_path / "whole" / "summary.json").read_text())
     assert all("valid_points" in frame for frame in summary["frames"].values())
 
