@@ -157,11 +157,14 @@ class LongWay:
             (px, py, weights), (x, y, z), valid = part, points, valid.unsqueeze(-2)
             used = ~weights.unused & valid
             found = reproject(cameras.proj, (x, y, z), used)
-            squared = squared_errors(found, px, py)
+            squared, depth = squared_errors(found, px, py), found.depth
+            if not surely_all(found.seen):
+                # At a used camera's centre, in front of it by rounding, it may be behind by that.
+                depth = torch.where(used, depth.clamp(min=0), torch.where(valid, depth, 0.0))
             outward = [
                 self._fitting(one)
                 for one in (
-                    found.depth if surely_all(valid) else torch.where(valid, found.depth, 0.0),
+                    depth,
                     mean_of(squared, found.seen, weights.squared),
                     parallax_of(cameras.centers, (x, y, z), used.to(found.x.dtype)),
                     safe_sqrt(squared),
