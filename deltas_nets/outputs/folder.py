@@ -127,7 +127,10 @@ class OutputFolder:
         """
         with self._lock:
             self._head = self._head | more
-            content = self._head | {"status": status, "frames": self.frames}
+            # In the order that was planned, whichever thread was faster.
+            place = {str(id): number for number, id in enumerate(self._head["anchors"])}
+            frames = sorted(self.frames.items(), key=lambda item: place.get(item[0], len(place)))
+            content = self._head | {"status": status, "frames": dict(frames)}
             if self._shard[1] > 1:
                 write_shard_summary(self.path, self._shard, content)
             else:
