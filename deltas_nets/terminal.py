@@ -16,6 +16,16 @@ READER_GONE = 141
 """Exit status where nobody reads what is printed any more, as the shell has it for others."""
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things.
+
+    Example:
+        >>> counted(1, "map"), counted(3, "view set")
+        ('1 map', '3 view sets')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def warn(text: str) -> None:
     """Print one line on standard error, for what is not fatal."""
     print(f"deltas: warning: {text}", file=sys.stderr)

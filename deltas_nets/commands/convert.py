@@ -65,7 +65,7 @@ class Convert(Command):
         from deltas_nets.captures.ids import ids_in_words
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import save_capture
-        from deltas_nets.terminal import progress, warn
+        from deltas_nets.terminal import counted, progress, warn
 
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         capture = self._in_metres(open_capture(self.capture, intrinsics=stated))
@@ -84,7 +84,7 @@ class Convert(Command):
             warn(doubt)
         if capture.lost:
             warn(f"frames that cannot be used are left out: {ids_in_words(capture.lost)}")
-        frames = "1 frame" if len(capture.frames) == 1 else f"{len(capture.frames)} frames"
+        frames = counted(len(capture.frames), "frame")
         read_as = f", read as {capture.layout}," if capture.layout else ""
         print(f"{frames}{read_as} written to {self.out} as {self.to}")
 

@@ -1,7 +1,6 @@
 """The command `deltas depth`."""
 
 import os
-import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,6 +12,7 @@ from deltas_nets.commands.depth_telling import show, tell
 from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible, usable_device
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
+from deltas_nets.commands.values import read_shard
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
@@ -25,18 +25,6 @@ if TYPE_CHECKING:
     from deltas_nets.predict.depth_map import PredictConfig
     from deltas_nets.predict.predictor import Predictor
     from deltas_nets.predict.search import Search
-
-
-def read_shard(text: str) -> tuple[int, int]:
-    """I and N of ``--shard I/N``.
-
-    Raises:
-        UserError: it is not of that form, or I is not among 1 to N.
-    """
-    match = re.fullmatch(r"(\d+)/(\d+)", text)
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise UserError("not a shard", f"--shard {text}", "use I/N with 1 <= I <= N, as 2/4")
-    return int(match[1]), int(match[2])
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, warn
+from deltas_nets.terminal import counted, progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
@@ -18,25 +18,26 @@ def tell(outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions", f
     from deltas_nets.outputs.summary import SUMMARY, read_summary
 
     kept = f", {outcome.kept} kept from an earlier run" if outcome.kept else ""
-    maps = "1 depth map" if outcome.written == 1 else f"{outcome.written} depth maps"
-    print(f"{maps} in {folder.path}{kept}")
+    print(f"{counted(outcome.written, 'depth map')} in {folder.path}{kept}")
     if options.unit != "metre":
         steps = f", {options.depth_scale:g} steps of a PNG in it" if format == "png" else ""
         print(f"depth is in {options.unit}{steps}; --scale METRES makes it metric")
     if not options.confidence:
         print("no confidence is written: the reference network states none")
     if outcome.blind:
-        warn(f"{outcome.blind} maps without a triangulated point are guesses: see summary.json")
+        maps = counted(outcome.blind, "map")
+        warn(f"a guess where no point was triangulated: {maps}, see summary.json")
     if outcome.piled:
+        maps = counted(outcome.piled, "map")
         warn(
-            f"points of {outcome.piled} maps pile up at an end of the depth that was searched: "
-            "is --depth-range too narrow, or a pose wrong? See summary.json"
+            f"points of {maps} pile up at an end of the depth that was searched: is --depth-range "
+            "too narrow, or a pose wrong? See summary.json"
         )
     saturated = sum("saturated_pixels" in record for record in folder.frames.values())
     if saturated:
         most = f"{options.max_depth:g} {'m' if options.unit == 'metre' else 'units'}"
         warn(
-            f"{saturated} maps have depth beyond {most} that is written as {most}: add "
+            f"depth beyond {most} is written as {most} in {counted(saturated, 'map')}: add "
             f"--depth-scale {options.depth_scale / 10:g} or --format npz; see summary.json"
         )
     if outcome.verdict is not None:

@@ -1,6 +1,7 @@
 """Values of flags that make no sense, told at once: before anything heavy is imported."""
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
-__all__ = ["check_values"]
+__all__ = ["check_values", "read_shard"]
 
 LEAST_SIDE = 32  # px
 _TWO_VIEWS = "use 2 or more, or let deltas depth complete --sensor-depth"
@@ -42,6 +43,18 @@ def _size(value: tuple[int, int], flag: str) -> None:
     if min(value) < LEAST_SIDE:
         given = " ".join(map(str, value))
         raise UserError("too small", f"{flag} {given}", f"use HEIGHT WIDTH of {LEAST_SIDE} or more")
+
+
+def read_shard(text: str, flag: str = "--shard") -> tuple[int, int]:
+    """I and N of ``--shard I/N``.
+
+    Raises:
+        UserError: it is not of that form, or I is not among 1 to N.
+    """
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise UserError("not a shard", f"{flag} {text}", "use I/N with 1 <= I <= N, as 2/4")
+    return int(match[1]), int(match[2])
 
 
 def _count(value: int, flag: str) -> None:
@@ -91,7 +104,8 @@ def _intrinsics(value: str, flag: str) -> None:
     Intrinsics.parse(value, flag)
 
 
-CHECKS: Mapping[str, Callable[[Any, str], None]] = {
+CHECKS: Mapping[str, Callable[[Any, str], object]] = {
+    "shard": read_shard,
     "depth_range": _range,
     "size": _size,
     "work_size": _size,

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from statistics import mean, median
 from typing import Any, NamedTuple
 
+from deltas_nets.terminal import counted
+
 __all__ = ["Verdict", "verdict"]
 
 USUAL_CONFIDENCE = 0.5
@@ -37,7 +39,12 @@ def verdict(records: Sequence[Mapping[str, Any]], *, short: int = 0) -> Verdict:
         >>> verdict([good, good]).line
         'mean confidence 0.55 (usual: 0.5 or more), 75 % of points triangulated'
     """
-    sure = [record["confidence"] for record in records if "confidence" in record]
+    # What the network says of itself: maps that agree are surer, also where all of them are wrong.
+    sure = [
+        record.get("network_confidence", record["confidence"])
+        for record in records
+        if "confidence" in record
+    ]
     shares = [
         record["valid_points"] / record["keypoints"]
         for record in records
@@ -51,7 +58,7 @@ def verdict(records: Sequence[Mapping[str, Any]], *, short: int = 0) -> Verdict:
         low = low or median(shares) < 0.5 * USUAL_SHARE
         words.append(f"{100 * mean(shares):.0f} % of points triangulated")
     if short:
-        words.append(f"{short} view sets short of views")
+        words.append(f"{counted(short, 'view set')} short of views")
     if low:
         words.append(
             "which is low: views are too near to each other, surfaces too plain, or poses or "

@@ -130,6 +130,7 @@ def predict_capture(
 
             def make(views: ViewSet) -> tuple[str, dict[str, Any]]:
                 found, record = second(views.anchor, config)
+                record["network_confidence"] = record["confidence"]
                 record |= _confidence(found.confidence)
                 _write(capture, views, folder, found, record)
                 return views.anchor, record
