@@ -38,6 +38,9 @@ class MeasuredDepth(NamedTuple):
 class Measured(Protocol):
     """Where measured depth comes from."""
 
+    def has(self, position: int) -> bool:
+        """Whether the frame at a position of the capture may have some; files are not read."""
+
     def __call__(self, position: int) -> MeasuredDepth | None:
         """That of the frame at a position of the capture; None where there is none.
 
@@ -51,6 +54,10 @@ class OfSensor(NamedTuple):
 
     capture: Capture
     deviation: float
+
+    def has(self, position: int) -> bool:
+        """See `Measured`."""
+        return self.capture.frames.at(position).depth_path is not None
 
     def __call__(self, position: int) -> MeasuredDepth | None:
         """See `Measured`."""
@@ -69,6 +76,10 @@ class OfPoints(NamedTuple):
     capture: Capture
     deviation: float
 
+    def has(self, position: int) -> bool:
+        """See `Measured`."""
+        return points_in_view(self.capture, position, least=1) is not None
+
     def __call__(self, position: int) -> MeasuredDepth | None:
         """See `Measured`."""
         points = points_in_view(self.capture, position, least=1)
@@ -84,6 +95,10 @@ class ByHand(NamedTuple):
     capture: Capture
     rows: Mapping[str, FloatArray]
     deviation: float
+
+    def has(self, position: int) -> bool:
+        """See `Measured`."""
+        return self.capture.frames.at(position).id in self.rows
 
     def __call__(self, position: int) -> MeasuredDepth | None:
         """See `Measured`."""
@@ -120,7 +135,8 @@ def measured_by_hand(file: Path, capture: Capture) -> dict[str, FloatArray]:
     found: dict[str, list[list[float]]] = {}
     for number, words in read_lines(file, name="file of measured depths", remedy=FORM):
         try:
-            id, (x, y, metres) = words[0], (float(word) for word in words[1:])
+            # From the right: ids of frames may have spaces.
+            id, (x, y, metres) = " ".join(words[:-3]), (float(word) for word in words[-3:])
         except ValueError as error:
             raise UserError(f"line {number} is not ID X Y METRES", file, FORM) from error
         height, width = capture.frame(id).image_size

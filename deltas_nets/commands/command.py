@@ -1,6 +1,6 @@
 """What all commands have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 __all__ = ["Command"]
@@ -13,6 +13,8 @@ class Command:
     """Whether an error shows its traceback."""
     going_on: ClassVar[str] = "start it again"
     """What to do after the command was stopped."""
+    checks: ClassVar[Mapping[str, Callable[[Any, str], object]]] = {}
+    """Of values of its own flags, by name: see `deltas_nets.commands.values`."""
 
     @classmethod
     def parsed_as(cls, arguments: Sequence[str]) -> Any:

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
 
 
+POINTS = 100_000
+
+
 @dataclass(frozen=True)
 class Convert(Command):
     """Write a capture in another format: ours, ScanNet's export, COLMAP, transforms.json.
@@ -44,8 +47,8 @@ class Convert(Command):
     """Maps that deltas depth made of this capture: they go along as its depth, where the format has
     a place, and confident points of them, with tracks, become its sparse points: what splatting
     starts from."""
-    points: int = 100_000
-    """With --depths: how many points, about."""
+    points: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """With --depths: how many points, about; 100 000 if not given."""
     intrinsics: Annotated[str | None, tyro.conf.arg(metavar="NUMBERS")] = None
     """Of all images, in quotes: fx fy cx cy and, of a lens, k1 k2 p1 p2 k3; or freiburg1."""
     debug: Flag = False
@@ -56,8 +59,10 @@ class Convert(Command):
         from deltas_nets.captures.new_folder import check_new
 
         check_new(self.out)
-        if self.points < 1:
+        if self.points is not None and self.points < 1:
             raise UserError("too few points", f"--points {self.points}", "give 1 or more")
+        if self.points is not None and self.depths is None:
+            raise UserError("points of which maps?", "--points", "add --depths DIR")
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
 
@@ -75,7 +80,7 @@ class Convert(Command):
 
             source = depth_source(capture, self.depths)
             with progress("points", len(source.ids)) as report:
-                found = seeds(source, self.points, report=report)
+                found = seeds(source, self.points or POINTS, report=report)
             capture = replace(with_maps(source.capture, self.depths), points=found)
             print(f"{len(found.xyz)} points that two maps or more agree on")
         with progress("writing", len(capture.frames)) as report:

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -12,7 +12,7 @@ from deltas_nets.commands.depth_telling import show, tell
 from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible, usable_device
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
-from deltas_nets.commands.values import read_shard
+from deltas_nets.commands.values import at_least_one, read_shard
 from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
@@ -78,11 +78,13 @@ class Depth(Captured, Measuring, Prediction):
     page: bool = True
     """Also write index.html to look at, contact_sheet.jpg and preview/ID.jpg."""
     shard: str = "1/1"
-    """I/N: this run does every N-th frame from the I-th, for N runs at once."""
+    """I/N: this run does every N-th frame from the I-th, for N runs at once; in the second pass it
+    hears its own frames alone."""
     overwrite: Flag = False
     """Start again instead of continuing, or write into a folder that holds other things."""
 
     going_on = "the same command goes on"
+    checks: ClassVar = {"workers": at_least_one}
 
     def run(self) -> None:
         """Run the command."""
@@ -111,7 +113,8 @@ class Depth(Captured, Measuring, Prediction):
                 capture, self.view_sets, self.views, working_depth=depth, anchors=anchors
             )
         check_all(capture, found.view_sets)
-        warn_of(capture, found.view_sets, self.view_sets, self.range)
+        if self.views != 1:
+            warn_of(capture, found.view_sets, self.view_sets, self.range)
         for finding in quick_findings(capture):
             if finding.cause not in TOLD_BEFORE:
                 warn(f"{finding.cause.value} ({finding.evidence}): {finding.cure}")
@@ -119,7 +122,7 @@ class Depth(Captured, Measuring, Prediction):
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)
         mine = found.view_sets[shard[0] - 1 :: shard[1]]
-        search = self._search(capture)
+        search = self._search(capture, [views.anchor for views in mine])
         folder = self._folder(capture, found, shard, options, predictor, config)
         outcome = predict_capture(
             predictor,
@@ -140,12 +143,13 @@ class Depth(Captured, Measuring, Prediction):
         if self.page:
             show(capture, self.folder, self.range)
 
-    def _search(self, capture: "Capture") -> "Search":
+    def _search(self, capture: "Capture", anchors: list[str]) -> "Search":
         from deltas_nets.predict.search import Asked, Completed, Followed
 
         measured = self.measured(capture)
         if self.views == 1:
             assert measured is not None  # or the flag would have been refused
+            self.check_completes(measured, capture, anchors)
             return Completed(capture, measured)
         if self.depth_range is None:
             return Followed(capture, measured)

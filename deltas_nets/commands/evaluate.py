@@ -8,7 +8,7 @@ import tyro
 
 from deltas_nets.commands.flags import Prediction
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress
+from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.scores import CaptureScores
@@ -84,7 +84,7 @@ class Evaluate(Prediction):
             with_depth_only,
         )
         from deltas_nets.evaluate.capture import evaluate_files, evaluate_network
-        from deltas_nets.outputs.summary import recorded_view_sets
+        from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_view_sets
 
         config = self.config()
         capture = open_capture(path).remembering()
@@ -96,6 +96,9 @@ class Evaluate(Prediction):
         view_sets = with_depth_only(capture, view_sets)
         check_all(capture, view_sets, with_depth=True)
         if self.predictions is not None:
+            settings = (read_summary(self.predictions / SUMMARY) or {}).get("settings", {})
+            if settings.get("sensor_depth", {}).get("from") == "sensor":
+                warn("the maps were made with the sensor depth that they are scored against")
             return evaluate_files(self.predictions, capture, view_sets, depth_range=self.range)
         predictor = self.predictor()
         predictor.check_asked(config, capture, view_sets)

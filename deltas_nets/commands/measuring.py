@@ -36,14 +36,17 @@ class Measuring:
 
         name, deviation = str(self.sensor_depth), self.sensor_deviation
         if self.sensor_depth is None:
+            if deviation is not None:
+                what = "a deviation of what?"
+                raise UserError(what, "--sensor-deviation", "add --sensor-depth")
             return None
+        if name == "sensor" and not any(capture.frames.arrays.depths):
+            what = "the capture has no sensor depth"
+            raise UserError(what, capture.path, "leave out --sensor-depth")
         if name != "points" and not capture.metric:
             what = "measured depth is in metres, and the capture is in a unit of its own"
             raise UserError(what, "--sensor-depth", f"add --scale-from {self.sensor_depth}")
         if name == "sensor":
-            if all(frame.depth_path is None for frame in capture.frames.values()):
-                what = "the capture has no sensor depth"
-                raise UserError(what, capture.path, "leave out --sensor-depth")
             return OfSensor(capture, deviation or SENSOR)
         if name == "points":
             if capture.points is None:
@@ -52,6 +55,21 @@ class Measuring:
             return OfPoints(capture, deviation or POINTS)
         rows = measured_by_hand(self.sensor_depth, capture)
         return ByHand(capture, rows, deviation or HAND)
+
+    def check_completes(self, measured: "Measured", capture: "Capture", anchors: list[str]) -> None:
+        """Whether something is measured of all frames that are to be completed.
+
+        Raises:
+            UserError: names those of which nothing is.
+        """
+        from deltas_nets.captures.ids import ids_in_words
+
+        position = {id: number for number, id in enumerate(capture.frames)}
+        without = [id for id in anchors if not measured.has(position[id])]
+        if without:
+            what = f"nothing is measured of {ids_in_words(without)}"
+            remedy = "name the others with --view-sets, or use --views 2 or more"
+            raise UserError(what, "--sensor-depth", remedy)
 
     def measured_record(self) -> dict[str, Any]:
         """What the results depend on, for the record of a run; nothing where nothing is asked."""

@@ -10,10 +10,9 @@ from typing import Any
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
-__all__ = ["check_values", "read_shard"]
+__all__ = ["at_least_one", "check_values", "read_shard"]
 
 LEAST_SIDE = 32  # px
-_TWO_VIEWS = "use 2 or more, or let deltas depth complete --sensor-depth"
 
 
 def check_values(command: Command) -> None:
@@ -25,12 +24,16 @@ def check_values(command: Command) -> None:
         UserError: a value is out of its range, or a file that is to be read is not there.
     """
     for field in fields(command):  # type: ignore[arg-type]
-        value, check = getattr(command, field.name), CHECKS.get(field.name)
+        value = getattr(command, field.name)
+        check = command.checks.get(field.name) or CHECKS.get(field.name)
         if value is not None and check is not None:
             check(value, f"--{field.name.replace('_', '-')}")
-    views, measured = (getattr(command, name, None) for name in ("views", "sensor_depth"))
-    if views == 1 and measured is None:
-        raise UserError("one view alone has no depth", "--views 1", _TWO_VIEWS)
+    if getattr(command, "views", None) == 1 and getattr(command, "sensor_depth", None) is None:
+        completes = hasattr(command, "sensor_depth")
+        remedy = "use 2 views or more"
+        if completes:
+            remedy = "use 2 or more, or add --sensor-depth, which is completed then"
+        raise UserError("one view alone has no depth", "--views 1", remedy)
 
 
 def _range(value: tuple[float, float], flag: str) -> None:
@@ -57,7 +60,12 @@ def read_shard(text: str, flag: str = "--shard") -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _count(value: int, flag: str) -> None:
+def at_least_one(value: int, flag: str) -> None:
+    """A count of what there must be.
+
+    Raises:
+        UserError: it is less than 1.
+    """
     if value < 1:
         raise UserError("too few", f"{flag} {value}", "use 1 or more")
 
@@ -109,8 +117,7 @@ CHECKS: Mapping[str, Callable[[Any, str], object]] = {
     "depth_range": _range,
     "size": _size,
     "work_size": _size,
-    "views": _count,
-    "workers": _count,
+    "views": at_least_one,
     "passes": _passes,
     "sensor_depth": _depths,
     "sensor_deviation": _share,

@@ -49,7 +49,8 @@ def with_maps(capture: Capture, folder: Path) -> Capture:
     Raises:
         UserError: the maps are of a format that captures do not hold.
     """
-    scale = recorded_depth_scale(folder)
+    # Whole, as frames join what is relative to the capture's own folder.
+    folder, scale = folder.resolve(), recorded_depth_scale(folder)
     frames = []
     for frame in capture.frames.values():
         file = folder / "depth" / f"{frame.id}.png"

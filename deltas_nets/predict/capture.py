@@ -183,6 +183,8 @@ def _found(
         "depth_range": [found.reach.near, found.reach.far],
         "seconds": round(time.perf_counter() - started, 4),
     } | _confidence(result.confidence)
+    if not views.sources:
+        del record["keypoints"]  # nothing was triangulated: what is measured was completed
     if found.piled is not None:
         record["points_pile_up"] = found.piled
     return found, record

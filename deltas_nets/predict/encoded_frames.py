@@ -45,7 +45,8 @@ class EncodedFrames:
         self.model = model
         self.capacity = capacity
         self._known: OrderedDict[_Key, EncodedImages] = OrderedDict()
-        self._lock = Lock()  # threads share it; at worst two encode the same frame
+        self._turns: dict[_Key, Lock] = {}
+        self._lock = Lock()  # threads share it
 
     @torch.inference_mode()
     def __call__(self, frames: Sequence[Frame], *, work_size: tuple[int, int]) -> EncodedImages:
@@ -59,11 +60,7 @@ class EncodedFrames:
             UserError: an image cannot be read.
         """
         keys = [(frame.image_path, frame.image_span, work_size) for frame in frames]
-        with self._lock:
-            views = {key: self._known[key] for key in keys if key in self._known}
-        for key, frame in zip(keys, frames, strict=True):
-            if key not in views:
-                views[key] = self._encoded(frame, work_size)
+        views = {key: self._view(key, frame) for key, frame in zip(keys, frames, strict=True)}
         with self._lock:
             for key in keys:
                 self._known[key] = views[key]
@@ -74,6 +71,21 @@ class EncodedFrames:
             torch.stack([views[key].images for key in keys]),
             Encoded.joined([views[key].encoded for key in keys]),
         )
+
+    def _view(self, key: _Key, frame: Frame) -> EncodedImages:
+        """A frame encoded, by one thread while others that want it wait."""
+        with self._lock:
+            turn = self._turns.setdefault(key, Lock())
+        with turn:
+            with self._lock:
+                known = self._known.get(key)
+            if known is None:
+                known = self._encoded(frame, key[-1])
+                with self._lock:
+                    self._known[key] = known
+        with self._lock:
+            self._turns.pop(key, None)
+        return known
 
     def _encoded(self, frame: Frame, work_size: tuple[int, int]) -> EncodedImages:
         """One image alone, so that what comes out does not depend on which others are known."""

@@ -143,8 +143,8 @@ def test_the_command_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("export", "--out", there), "the file exists", "--overwrite")
     assert there.read_bytes() == b"mine"
     assert_one_line(run("export", "--out", out, "--views", 1), "2 views or more")
-    assert_one_line(run("export", "--out", out, "--size", 8, 8), "32 x 32")
-    assert_one_line(run("export", "--out", out, "--depth-range", 3, 1), "near < far")
+    assert_one_line(run("export", "--out", out, "--size", 8, 8), "--size 8 8", "32 or more")
+    assert_one_line(run("export", "--out", out, "--depth-range", 3, 1), "NEAR < FAR")
     assert_one_line(run("export", "--out", out, "--weights", "nothing"), "no such weights")
     assert_one_line(run("export"), "--out", "see deltas export --help")
     assert not out.exists()

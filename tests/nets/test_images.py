@@ -37,7 +37,8 @@ def test_every_image_is_decoded_once(
     run: Run, make_capture: MakeCapture, tmp_path: Path, decodes: Counter[str], command: str
 ) -> None:
     capture = make_capture()
-    out = ["--out", tmp_path / "out", "--depth-range", 0.5, 10] if command == "depth" else []
+    flags = ["--out", tmp_path / "out", "--depth-range", 0.5, 10, "--no-page"]
+    out = flags if command == "depth" else []
     assert run(command, capture, *out).code == 0
     names = [f"{id}.jpg" for id in range(4)]
     names += [f"{id}.png" for id in range(4)] if command == "evaluate" else []
