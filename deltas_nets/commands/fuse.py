@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, warn
+from deltas_nets.terminal import counted, progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
@@ -105,10 +105,13 @@ class Fuse(Command):
         )
         source = depth_source(capture, self.depths, min_confidence=self.min_confidence)
         if isinstance(source, Predicted) and source.missing:
-            warn(f"{source.missing} maps of the folder are not finished, and left out")
+            warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
         if len(source.ids) == 1 and config.neighbours:
             warn("there is one map, and none to compare it with")
             config = sensible(FuseConfig, voxel=self.voxel, neighbours=0)
+        elif config.neighbours and config.least >= len(source.ids):
+            what = f"each of {len(source.ids)} maps has {len(source.ids) - 1} to agree with"
+            raise UserError(what, f"--least {self.least}", "lower it")
         device = usable_device(self.device)
         with progress("fuse", len(source.ids)) as report:
             fused = fuse_capture(
@@ -122,18 +125,27 @@ class Fuse(Command):
                 overwrite=self.overwrite,
                 report=report,
             )
-        self._tell(fused)
+        self._tell(fused, source.least_confidence)
 
     def products(self) -> "list[FusedName]":
         """What is asked for."""
         asked: dict[FusedName, bool] = {"cloud": self.cloud, "mesh": self.mesh, "glb": self.glb}
         return [name for name, wanted in asked.items() if wanted] or ["cloud", "mesh"]
 
-    def _tell(self, fused: "Fused") -> None:
+    def _tell(self, fused: "Fused", least_confidence: float) -> None:
         names = " and ".join(str(file) for file in fused.files)
         counts = ", ".join(f"{count} {what}" for what, count in fused.counts.items())
         print(f"{names}: {counts or 'kept from an earlier run'}")
-        print(f"{fused.frames} maps, voxels of {fused.voxel:g}")
+        print(f"{counted(fused.frames, 'map')}, voxels of {fused.voxel:g}")
+        if fused.left_out is not None:
+            doubtful, unconfirmed = fused.left_out
+            print(
+                f"of their depth {fused.left_out.used:.0%} is used; {doubtful:.0%} is less sure "
+                f"than --min-confidence {least_confidence:.2g}, {unconfirmed:.0%} is not confirmed "
+                "by other maps"
+            )
+        if fused.doubt is not None:
+            warn(fused.doubt)
 
 
 def fuse_maps(
@@ -141,7 +153,8 @@ def fuse_maps(
 ) -> None:
     """What `deltas depth` does at its end: fuse the maps of its folder, if all are there.
 
-    Where other shards are still at work the last of them does it.
+    Where other shards are still at work the last of them does it. Maps are worth more: what
+    hinders it is only a warning.
     """
     from deltas_nets.outputs.summary import SUMMARY, read_summary
 
@@ -155,4 +168,7 @@ def fuse_maps(
             device=device,
             overwrite=overwrite,
         )
-        fuse.fuse(capture, folder)
+        try:
+            fuse.fuse(capture, folder)
+        except UserError as error:
+            warn(f"nothing was fused: {error}; the maps are whole")

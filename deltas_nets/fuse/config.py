@@ -26,5 +26,8 @@ class FuseConfig:
             raise ValueError(f"--neighbours must be 0 or more, got {self.neighbours}")
         if self.least < 1:
             raise ValueError(f"--least must be 1 or more, got {self.least}")
+        if 0 < self.neighbours < self.least:
+            what = f"--least {self.least} of {self.neighbours} maps can never agree"
+            raise ValueError(f"{what}: lower it, or raise --neighbours")
         if not self.deviations > 0:
             raise ValueError(f"--deviations must be positive, got {self.deviations:g}")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.cloud import Cloud
 from deltas_nets.fuse.config import FuseConfig
+from deltas_nets.fuse.left_out import LeftOut, cure, doubt, mean_left_out
 from deltas_nets.fuse.mesh import without_small_parts
 from deltas_nets.fuse.prepared import PreparedViews
 from deltas_nets.fuse.products import FUSED, FusedName
@@ -41,12 +42,16 @@ class Fused(NamedTuple):
         voxel: side of a voxel.
         counts: points, vertices and faces of what was made now; none of what was there.
         files: what there is.
+        left_out: of the maps' depth; None if nothing was made now.
+        doubt: a line on what was made now, where it is little.
     """
 
     frames: int
     voxel: float
     counts: Mapping[str, int]
     files: Sequence[Path]
+    left_out: LeftOut | None = None
+    doubt: str | None = None
 
 
 def fuse_capture(
@@ -96,12 +101,22 @@ def fuse_capture(
         head = {"writer": WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / SUMMARY, {**head, "status": "running", "settings": settings})
-        _add_up(source, out, config, sums, settings, gigabytes, report)
-        counts = _write(sums, sizes, files)
+        left_out = _add_up(source, out, config, sums, settings, gigabytes, report)
+        made, counts = _made(sums, sizes)
+        if not all(counts.values()):
+            # No settings hold the folder then: other ones, as the remedy has them, may follow.
+            (out / SUMMARY).unlink(missing_ok=True)
+            (out / STATE).unlink(missing_ok=True)
+            raise _nothing(source, left_out, sizes, config)
+        for name, file in files.items():
+            FUSED[name].write(file, made[FUSED[name].of])
     ended = {"status": "complete", "frames": len(source.ids), **counts}
+    ended["left_out"] = {name: round(part, 4) for name, part in left_out._asdict().items()}
     write_json(out / SUMMARY, {**head, **ended, "settings": settings})
     (out / STATE).unlink(missing_ok=True)
-    return Fused(len(source.ids), sizes.voxel, counts, list(files.values()))
+    doubtful = doubt(counts, left_out, sizes, config)
+    made_now = list(files.values())
+    return Fused(len(source.ids), sizes.voxel, counts, made_now, left_out, doubtful)
 
 
 def _check_folder(
@@ -151,8 +166,8 @@ def _add_up(
     settings: Mapping[str, Any],
     gigabytes: float,
     report: Callable[[str], None],
-) -> None:
-    """Add all views that no earlier run has added."""
+) -> LeftOut:
+    """Add all views that no earlier run has added; what all of them leave out."""
     made_of = {"settings": settings, "sums": sorted(sums)}
     done = read_state(out, sums, made_of)
     for id in done:
@@ -160,11 +175,11 @@ def _add_up(
     kept = len(done)
     saved, saving = time.monotonic(), 0.0
     try:
-        left = [id for id in source.ids if id not in set(done)]
-        for id, view in PreparedViews(source, config).ahead(left):
+        left = [id for id in source.ids if id not in done]
+        for id, view, left_out in PreparedViews(source, config).ahead(left):
             for added in sums.values():
                 added.add(view)
-            done.append(id)
+            done[id] = left_out
             report(id)
             _check_size(sums.get("surface"), gigabytes)
             now = time.monotonic()
@@ -174,18 +189,18 @@ def _add_up(
     finally:
         if kept < len(done) < len(source.ids):
             write_state(out, sums, done, made_of)
+    return mean_left_out(done.values())
 
 
 def _check_size(volume: Sums | None, gigabytes: float) -> None:
     if isinstance(volume, Volume) and len(volume.blocks) * BYTES_OF_BLOCK > gigabytes * 1e9:
-        what = f"the volume has grown beyond {gigabytes:g} GB"
-        raise UserError(what, "--voxel", "use larger voxels, or allow more with --memory")
+        what = f"the volume has grown beyond {gigabytes:g} GB with voxels of {volume.voxel:g}"
+        remedy = "the same command goes on with more --memory; or begin anew with larger voxels"
+        raise UserError(what, "--memory", f"{remedy} and --overwrite")
 
 
-def _write(
-    sums: Mapping[str, Sums], sizes: Sizes, files: Mapping[FusedName, Path]
-) -> dict[str, int]:
-    """Write the products; nothing where there is nothing to write."""
+def _made(sums: Mapping[str, Sums], sizes: Sizes) -> tuple[dict[str, Any], dict[str, int]]:
+    """What the sums show, and how much of it there is."""
     counts: dict[str, int] = {}
     made: dict[str, Any] = {}
     for kind, added in sums.items():
@@ -195,12 +210,11 @@ def _write(
         elif isinstance(added, Volume):
             made[kind] = without_small_parts(surface(added), SMALL_PART * sizes.voxel**2)
             counts["vertices"], counts["faces"] = len(made[kind].vertices), len(made[kind].faces)
-    if not all(counts.values()):
-        raise UserError(
-            "no depth is left: maps do not overlap, or do not agree",
-            "--no-consistency",
-            "add it to use all depth, or lower --min-confidence",
-        )
-    for name, file in files.items():
-        FUSED[name].write(file, made[FUSED[name].of])
-    return counts
+    return made, counts
+
+
+def _nothing(source: DepthSource, left_out: LeftOut, sizes: Sizes, config: FuseConfig) -> UserError:
+    what = f"voxels of {sizes.voxel:g} show no surface of the depth that is left"
+    if left_out.used == 0:
+        what = "no depth is left: maps do not overlap, or do not agree"
+    return UserError(what, source.capture.path, cure(left_out, sizes, config))

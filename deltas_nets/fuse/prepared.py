@@ -3,19 +3,35 @@
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 
 from deltas_nets.fuse.agreement import agreeing
 from deltas_nets.fuse.config import FuseConfig
 from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.fuse.left_out import LeftOut, left_out_of
 from deltas_nets.fuse.neighbours import neighbours
 from deltas_nets.fuse.sources import DepthSource
 
-__all__ = ["PreparedViews"]
+__all__ = ["Prepared", "PreparedViews"]
 
 REMEMBERED = 24
 """Maps that are kept in memory besides the neighbours of one: frames share them."""
+
+
+class Prepared(NamedTuple):
+    """A map to be added up.
+
+    Attributes:
+        id: of its frame.
+        view: what is confirmed of it.
+        left_out: what is not used; None if it had no depth.
+    """
+
+    id: str
+    view: DepthView
+    left_out: LeftOut | None
 
 
 class PreparedViews:
@@ -33,15 +49,15 @@ class PreparedViews:
         self._positions = np.array([place[id] for id in source.ids], dtype=np.intp)
         self._place = place
 
-    def ahead(self, ids: Sequence[str]) -> Iterator[tuple[str, DepthView]]:
-        """Ids and their maps; while one is used, another thread prepares the next."""
+    def ahead(self, ids: Sequence[str]) -> Iterator[Prepared]:
+        """The maps of some ids; while one is used, another thread prepares the next."""
         with ThreadPoolExecutor(1) as worker:
-            ready = worker.submit(self.view, ids[0]) if ids else None
-            for id, following in zip(ids, [*ids[1:], None], strict=True):
+            ready = worker.submit(self._prepared, ids[0]) if ids else None
+            for following in [*ids[1:], None][: len(ids)]:
                 assert ready is not None
-                view = ready.result()
-                ready = None if following is None else worker.submit(self.view, following)
-                yield id, view
+                prepared = ready.result()
+                ready = None if following is None else worker.submit(self._prepared, following)
+                yield prepared
 
     def view(self, id: str) -> DepthView:
         """The map of a frame, as far as it is confirmed.
@@ -57,6 +73,11 @@ class PreparedViews:
         near = neighbours(view, frames, candidates, config.neighbours)
         others = [self._read(frames.id_at(position)) for position in near]
         return agreeing(view, others, least=config.least, deviations=config.deviations)
+
+    def _prepared(self, id: str) -> Prepared:
+        view = self.view(id)
+        doubtful = self._source.doubtful.get(id, 0.0)
+        return Prepared(id, view, left_out_of(doubtful, self._read(id), view))
 
     def _read(self, id: str) -> DepthView:
         if id not in self._known:

@@ -1,6 +1,7 @@
 """How large voxels should be, and what that takes, by a look at some maps."""
 
 from collections.abc import Sequence
+from decimal import ROUND_CEILING, Context
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ class Sizes(NamedTuple):
     Attributes:
         voxel: side of a voxel.
         truncation: how far behind a surface it is averaged.
+        depth: of the maps, the median.
         area: of the surfaces, about.
         extent: from the origin to the farthest point.
         origin: ``(3,)`` float64, in the middle of the cameras.
@@ -40,6 +42,7 @@ class Sizes(NamedTuple):
 
     voxel: float
     truncation: float
+    depth: float
     area: float
     extent: float
     origin: Tensor
@@ -80,8 +83,12 @@ def look_at(source: DepthSource, voxel: float | None) -> Sizes:
             per_pixel.append(depths[-1] / float(view.K[0, 0]))
             points.append(_some_points(view, origin))
     if not depths:
-        what = "no pixel of the maps has depth that is sure enough"
-        raise UserError(what, source.capture.path, "lower --min-confidence")
+        what = "no pixel of the maps has depth"
+        if source.least_confidence == 0:
+            raise UserError(what, source.capture.path, "look at them: there is nothing to fuse")
+        what = f"{what} that is sure enough ({source.least_confidence:.2g} or more)"
+        remedy = "deltas fuse --min-confidence 0 uses all depth, sure or not"
+        raise UserError(what, source.capture.path, remedy)
     std = float(np.median(stds))
     if voxel is None:
         voxel = float(f"{max(std / STD_PER_VOXEL, float(np.median(per_pixel))):.2g}")
@@ -107,7 +114,7 @@ def _measured(
     # Frames between those that were looked at see some of the same, and something new.
     area = cells * side**2 * min(more, 2.0)
     truncation = max(VOXELS_AROUND * voxel, std)
-    return Sizes(voxel, truncation, area, float(places.abs().max()), origin)
+    return Sizes(voxel, truncation, depth, area, float(places.abs().max()), origin)
 
 
 def check_memory(sizes: Sizes, gigabytes: float) -> None:
@@ -122,7 +129,12 @@ def check_memory(sizes: Sizes, gigabytes: float) -> None:
         fits = fits._replace(voxel=larger, truncation=max(VOXELS_AROUND * larger, fits.truncation))
     if fits is not sizes:
         raise UserError(
-            f"voxels of {sizes.voxel:g} need about {max(sizes.bytes / 1e9, 0.1):.2g} GB of memory",
+            f"voxels of {sizes.voxel:g} need about {_up(sizes.bytes / 1e9)} GB of memory",
             "--voxel",
-            f"use {fits.voxel:.1g} or more, or allow more with --memory",
+            f"use {_up(fits.voxel)} or more, or allow more with --memory",
         )
+
+
+def _up(value: float) -> str:
+    """Two digits of a number that are not less: what is advised is not refused."""
+    return f"{float(Context(prec=2, rounding=ROUND_CEILING).create_decimal_from_float(value)):g}"

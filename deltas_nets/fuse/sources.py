@@ -21,7 +21,7 @@ from deltas_nets.captures.straight import StraightFrame, photo_pixels, straight
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.depth_view import DepthView
 from deltas_nets.fuse.deviation import std_of_confidence, std_of_sensor
-from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map
+from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale
 
 __all__ = ["DepthSource", "Predicted", "Sensed", "depth_source"]
@@ -47,6 +47,14 @@ class DepthSource(Protocol):
     @property
     def settings(self) -> Mapping[str, Any]:
         """What the depth depends on, for JSON."""
+
+    @property
+    def least_confidence(self) -> float:
+        """Of pixels that are used; 0 where all are."""
+
+    @property
+    def doubtful(self) -> Mapping[str, float]:
+        """Share of the depth that is less sure than that, of frames whose view was asked for."""
 
     def check(self) -> None:
         """Raise what reading would, as far as that is quickly told."""
@@ -114,6 +122,8 @@ class Predicted:
         self.missing = len(wanted) - len(self.ids)
         if not self.ids:
             raise UserError("the folder has no finished map", folder, "run deltas depth again")
+        self.least_confidence = self._least / 255 if self._has_confidence else 0.0
+        self.doubtful: dict[str, float] = {}
         self.settings = {"depth": summary["settings"], "min_confidence": self._least / 255}
 
     def check(self) -> None:
@@ -123,7 +133,7 @@ class Predicted:
                 file = self._folder / kind / f"{id}.png"
                 if file.exists() and header_of_whole_file(file) is None:
                     what = f"the {kind} map is no whole PNG"
-                    raise UserError(what, file, "remove it and run deltas depth again")
+                    raise UserError(what, file, MAKE_ANEW)
 
     def view(self, id: str) -> DepthView:
         """The map of a frame."""
@@ -136,9 +146,12 @@ class Predicted:
                 _read_confidence(self._folder / "confidence" / f"{id}.png")
             )
             if confidence.shape != depth.shape:
-                what = f"confidence of {id} is not of the depth map's size"
-                raise UserError(what, self._folder, "run deltas depth again")
+                what = "the confidence is not of the depth map's size"
+                raise UserError(what, self._folder / "confidence" / f"{id}.png", MAKE_ANEW)
+            known = depth > 0
             depth = torch.where(confidence >= self._least, depth, 0.0)
+            kept = int((depth > 0).sum()) / max(1, int(known.sum()))
+            self.doubtful[id] = 1 - kept if known.any() else 0.0
         return _of_photo(frame, depth, std_of_confidence(depth, confidence), most=MOST_PREDICTED)
 
 
@@ -146,15 +159,17 @@ class Sensed:
     """What a capture's depth sensor measured; see `DepthSource`."""
 
     def __init__(self, capture: Capture) -> None:
-        if not capture.metric:
-            what = "sensor depth is in metres, and the capture is not"
-            raise UserError(what, capture.path, "say --scale METRES")
         self.capture = capture
         depths = capture.frames.arrays.depths
         self.ids = [id for id, depth in zip(capture.frames, depths, strict=True) if depth]
         if not self.ids:
             what = "the capture has no sensor depth"
             raise UserError(what, capture.path, "name a folder of deltas depth")
+        if not capture.metric:
+            what = "sensor depth is in metres, and the capture is not"
+            raise UserError(what, capture.path, "say --scale METRES")
+        self.least_confidence = 0.0
+        self.doubtful: dict[str, float] = {}
         self.settings = {"depth": "sensor", "cameras": capture.fingerprint()}
 
     def check(self) -> None:
@@ -182,7 +197,7 @@ def _read_confidence(path: Path) -> NDArray[np.uint8]:
             return np.array(image.convert("L"))
     except (OSError, SyntaxError, ValueError) as error:
         what = f"the confidence map cannot be read ({error})"
-        raise UserError(what, path, "run deltas depth again") from error
+        raise UserError(what, path, MAKE_ANEW) from error
 
 
 def _step(size: tuple[int, int], most: int) -> int:

@@ -1,7 +1,7 @@
 """What a fusion knows after some frames, in one file, so that a run that was stopped goes on."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.fuse.left_out import LeftOut
 from deltas_nets.outputs.atomic_files import write_atomically
 
 __all__ = ["STATE", "Sums", "read_state", "write_state"]
@@ -31,9 +32,9 @@ class Sums(Protocol):
 
 
 def write_state(
-    folder: Path, sums: Mapping[str, Sums], done: Sequence[str], settings: object
+    folder: Path, sums: Mapping[str, Sums], done: Mapping[str, LeftOut | None], settings: object
 ) -> None:
-    """Write the sums of the frames that are done, atomically.
+    """Write the sums of the frames that are done, and what was left out of each, atomically.
 
     Raises:
         UserError: the system refuses.
@@ -43,26 +44,29 @@ def write_state(
         for name, added in sums.items()
         for part, tensor in added.state().items()
     }
-    metadata = {"done": json.dumps(list(done)), "settings": json.dumps(settings)}
+    metadata = {"done": json.dumps(done), "settings": json.dumps(settings)}
     # By its name: in memory the bytes would be there twice.
     write_atomically(folder / STATE, lambda file: save_file(tensors, file.name, metadata))
 
 
-def read_state(folder: Path, sums: Mapping[str, Sums], settings: object) -> list[str]:
+def read_state(
+    folder: Path, sums: Mapping[str, Sums], settings: object
+) -> dict[str, LeftOut | None]:
     """Restore the sums of an earlier run.
 
     Returns:
-        The frames that they hold; none where no run of these settings left any.
+        The frames that they hold, each with what was left out; none where no run of these
+        settings left any.
     """
     try:
         with safe_open(str(folder / STATE), framework="pt") as opened:
             metadata = opened.metadata() or {}
             if metadata.get("settings") != json.dumps(settings):
-                return []
+                return {}
             names = opened.keys()
             tensors = {name: opened.get_tensor(name) for name in names}
     except (SafetensorError, OSError):
-        return []
+        return {}
     for name, added in sums.items():
         start = f"{name}."
         added.restore(
@@ -72,5 +76,5 @@ def read_state(folder: Path, sums: Mapping[str, Sums], settings: object) -> list
                 if key.startswith(start)
             }
         )
-    done: list[str] = json.loads(metadata["done"])
-    return done
+    done: dict[str, list[float] | None] = json.loads(metadata["done"])
+    return {id: None if shares is None else LeftOut(*shares) for id, shares in done.items()}

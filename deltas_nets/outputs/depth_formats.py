@@ -16,6 +16,7 @@ from deltas_nets.outputs.atomic_files import write_atomically
 
 __all__ = [
     "DEPTH_FORMATS",
+    "MAKE_ANEW",
     "MAX_STEPS",
     "MILLIMETRES",
     "DepthFormat",
@@ -26,6 +27,8 @@ __all__ = [
 ]
 
 MILLIMETRES = 1000.0  # steps in a metre
+MAKE_ANEW = "remove it and run deltas depth again"
+"""What is there is kept by `deltas depth`, damaged or not."""
 MAX_STEPS = 65534  # 65535 means "none" to some readers
 
 DepthFormatName = Literal["png", "npz", "tiff", "pfm"]
@@ -125,6 +128,6 @@ def read_depth_map(folder: Path, id: str, scale: float) -> NDArray[np.float32]:
                 return kind.read(file, scale)
             except (OSError, ValueError, KeyError, SyntaxError, BadZipFile, EOFError) as error:
                 what = f"the depth map cannot be read ({error})"
-                raise UserError(what, file, "run deltas depth again") from error
+                raise UserError(what, file, MAKE_ANEW) from error
     file = folder / "depth" / f"{id}.png"
     raise UserError("no depth map (No such file or directory)", file, "run deltas depth first")

@@ -17,6 +17,7 @@ from deltas_nets.page.colours import NONE, Scale, lookup_table, ticks_of
 from deltas_nets.page.maps import Maps
 from deltas_nets.page.pictures import FramePictures, jpeg, scales_of
 from deltas_nets.page.scene import Camera, Layer, camera_of, up_of
+from deltas_nets.terminal import counted
 
 __all__ = ["ShownFrame", "bytes_of_frame", "bytes_of_layer", "html_of", "shown_frame"]
 
@@ -173,7 +174,7 @@ def _notes(maps: Maps, frames: Sequence[ShownFrame]) -> list[str]:
             "page stays small; preview/ has all of them."
         )
     if maps.missing:
-        notes.append(f"{len(maps.missing)} maps are missing; the same deltas depth goes on.")
+        notes.append(f"{counted(len(maps.missing), 'map')} missing; the same deltas depth goes on.")
     if maps.unit != "m":
         notes.append("The capture has no metres: depth is in its own unit.")
     return notes

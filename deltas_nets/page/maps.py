@@ -12,7 +12,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map
+from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.products import read_points_ply
 from deltas_nets.outputs.summary import (
     SUMMARY,
@@ -68,8 +68,8 @@ class Maps(NamedTuple):
         """
         depth = read_depth_map(self.folder, id, self.steps)
         if depth.ndim != 2 or depth.size == 0:
-            file = self.folder / "depth" / id
-            raise UserError("this is no depth map", file, "run deltas depth again")
+            file = _map_file(self.folder, id) or self.folder / "depth" / id
+            raise UserError("this is no depth map", file, MAKE_ANEW)
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def confidence(self, id: str) -> NDArray[np.float32] | None:
@@ -86,7 +86,7 @@ class Maps(NamedTuple):
                 return np.asarray(image.convert("L")).astype(np.float32) / np.float32(255)
         except (OSError, SyntaxError, ValueError) as error:
             what = f"the confidence cannot be read ({error})"
-            raise UserError(what, file, "run deltas depth again") from error
+            raise UserError(what, file, MAKE_ANEW) from error
 
     def points(self, id: str) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
         """Points ``(N, 3)`` of a frame's map in the world, and their colours; None without a file.
@@ -99,9 +99,11 @@ class Maps(NamedTuple):
             return None
         try:
             points, colors = read_points_ply(file)
+        except UserError as error:
+            raise UserError(error.what, file, MAKE_ANEW) from error
         except (OSError, ValueError) as error:
             what = f"the points cannot be read ({error})"
-            raise UserError(what, file, "run deltas depth again") from error
+            raise UserError(what, file, MAKE_ANEW) from error
         return points.astype(np.float64), colors
 
 
@@ -127,8 +129,8 @@ def open_maps(capture: Capture, folder: Path, fused: Path | None = None) -> Maps
     if not known:
         what = f"the capture has none of the frames of the maps ({ids_in_words(anchors)})"
         raise UserError(what, folder, "name the capture that the maps were made of")
-    ids = tuple(id for id in known if _map_exists(folder, id))
-    missing = tuple(id for id in known if not _map_exists(folder, id))
+    ids = tuple(id for id in known if _map_file(folder, id))
+    missing = tuple(id for id in known if not _map_file(folder, id))
     if not ids:
         raise UserError("there is no depth map", folder / "depth", "run deltas depth first")
     if missing:
@@ -153,5 +155,6 @@ def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> 
     return capture
 
 
-def _map_exists(folder: Path, id: str) -> bool:
-    return any((folder / "depth" / f"{id}.{name}").exists() for name in DEPTH_FORMATS)
+def _map_file(folder: Path, id: str) -> Path | None:
+    files = (folder / "depth" / f"{id}.{name}" for name in DEPTH_FORMATS)
+    return next(filter(Path.exists, files), None)

@@ -1,6 +1,8 @@
 """`deltas fuse`: what it writes, how it goes on, what it refuses."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +16,11 @@ from small_capture import write_capture
 
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.commands.fuse import fuse_maps
+from deltas_nets.errors import UserError
 from deltas_nets.fuse import FuseConfig
 from deltas_nets.fuse.fusing import SUMMARY, fuse_capture
+from deltas_nets.fuse.left_out import LeftOut, cure
+from deltas_nets.fuse.sizes import _up, check_memory, look_at
 from deltas_nets.fuse.sources import depth_source
 from deltas_nets.fuse.state import STATE
 
@@ -123,16 +128,26 @@ def test_a_corrupt_map_is_named_before_anything_is_written(
 ) -> None:
     file = maps[1] / kind / "2.png"
     file.write_bytes(file.read_bytes()[:-30])
-    assert_one_line(run("fuse", *maps, "--out", tmp_path / "out"), f"{kind}/2.png", "no whole PNG")
+    assert_one_line(
+        run("fuse", *maps, "--out", tmp_path / "out"), f"{kind}/2.png", "no whole PNG", "remove it"
+    )
     assert not (tmp_path / "out").exists()
 
 
 def test_voxels_too_fine_are_refused_with_those_that_fit(
     maps: tuple[Path, Path], tmp_path: Path, run: Run
 ) -> None:
-    result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 1e-6)
-    assert_one_line(result, "voxels of 1e-06", "GB", "use 0.00")
+    result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 1e-6, "--memory", 0.1)
+    assert_one_line(result, "voxels of 1e-06", "GB", "use 0.0")
     assert not (tmp_path / "out").exists()
+    (fitting,) = re.findall(r"use (\S+) or more", result.err)
+    source = depth_source(open_capture(maps[0]), maps[1])
+    check_memory(look_at(source, float(fitting)), 0.1)
+
+
+@pytest.mark.parametrize("value", [0.0151, 0.0199, 0.02, 0.1, 0.99, 3.01, 1e-6])
+def test_what_is_advised_is_rounded_up(value: float) -> None:
+    assert value <= float(_up(value)) < 1.1 * value
 
 
 def test_maps_that_contradict_leave_nothing_and_say_so(
@@ -145,8 +160,60 @@ def test_maps_that_contradict_leave_nothing_and_say_so(
         Image.fromarray(depth).save(tmp_path / "maps" / "depth" / f"{id}.png")
     arguments = ("fuse", path, tmp_path / "maps", "--out", tmp_path / "out")
     assert_one_line(run(*arguments), "no depth is left", "--no-consistency")
-    assert run(*arguments, "--no-consistency").code == 2  # other settings
-    assert run(*arguments, "--no-consistency", "--overwrite").code == 0
+    assert run(*arguments, "--no-consistency").code == 0  # what failed holds no folder
+
+
+def test_advice_never_names_what_was_given(maps: tuple[Path, Path]) -> None:
+    sizes = look_at(depth_source(open_capture(maps[0]), maps[1]), 0.05)
+    coarse = sizes._replace(voxel=100)
+    config = FuseConfig()
+    assert "--voxel 0.03" in cure(LeftOut(0.1, 0.5), coarse, config)
+    assert "--no-consistency" in cure(LeftOut(0, 1), coarse, config)
+    assert "--least 1" in cure(LeftOut(0, 1), sizes, FuseConfig(least=3))
+    assert "--min-confidence 0" in cure(LeftOut(0.9, 0.1), sizes, config)
+    assert "--" not in cure(LeftOut(0, 0), sizes, config)
+
+
+def test_voxels_as_large_as_the_scene_are_named(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    arguments = ("fuse", *maps, "--out", tmp_path / "out", "--no-consistency", "--voxel")
+    assert_one_line(run(*arguments, 100, "--mesh"), "voxels of 100", "--voxel 0.03 shows more")
+    few = run(*arguments, 0.3)
+    assert few.code == 0 and "little was made" in few.warnings[0] and "--voxel" in few.warnings[0]
+
+
+def test_maps_that_can_never_agree_are_refused(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    arguments = ("fuse", *maps, "--out", tmp_path / "out", "--least")
+    assert_one_line(run(*arguments, 20), "--least 20 of 8", "--neighbours")
+    assert_one_line(run(*arguments, 4), "each of 4 maps", "--least 4", "lower it")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_left_out_is_told(maps: tuple[Path, Path], tmp_path: Path, run: Run) -> None:
+    """A half that is unsure; a quarter that one map has elsewhere, and edges that one sees."""
+    for id in range(4):
+        half = np.full((48, 64), 230, dtype=np.uint8)
+        half[:24] = 20
+        Image.fromarray(half).save(maps[1] / "confidence" / f"{id}.png")
+    file = maps[1] / "depth" / "2.png"
+    steps = np.array(Image.open(file))
+    steps[36:] = 1000
+    Image.fromarray(steps).save(file)
+    result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05)
+    assert "50% is less sure than --min-confidence 0.3, " in result.out
+    left_out = json.loads((tmp_path / "out" / SUMMARY).read_text())["left_out"]
+    assert left_out["doubtful"] == 0.5 and 0.0625 <= left_out["unconfirmed"] < 0.1
+
+
+def test_no_sensor_is_told_before_its_unit(
+    make_capture: MakeCapture,
+) -> None:
+    capture = replace(open_capture(make_capture(depth_size=None)), metric=False)
+    with pytest.raises(UserError, match="no sensor depth"):
+        depth_source(capture, Path("sensor"))
 
 
 def test_one_map_alone_is_fused_with_a_warning(
@@ -158,6 +225,7 @@ def test_one_map_alone_is_fused_with_a_warning(
         (tmp_path / "maps" / "depth" / f"{id}.png").unlink()
     result = run("fuse", path, tmp_path / "maps", "--out", tmp_path / "out")
     assert result.code == 0, result.err
+    assert result.warnings[0] == "3 maps of the folder left out, as not finished"
     assert len(result.warnings) == 2
     assert "none to compare" in result.warnings[1]
 
@@ -214,3 +282,15 @@ def test_the_depth_command_fuses_what_is_complete(maps: tuple[Path, Path]) -> No
     (folder / "summary.json").write_text(json.dumps({**summary, "status": "stopped"}))
     fuse_maps(capture, folder, device="cpu", **wanted)
     assert not (folder / "mesh.ply").exists()
+
+
+def test_the_depth_command_warns_where_nothing_can_be_fused(
+    make_capture: MakeCapture, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What its own --min-confidence left may be less than `deltas fuse` wants."""
+    path = make_capture()
+    folder = tmp_path / "maps"
+    capture = write_maps(folder, path, confidence=0.2)
+    fuse_maps(capture, folder, cloud=False, mesh=True, device="cpu", overwrite=False)
+    told = capfd.readouterr().err
+    assert "nothing was fused" in told and "deltas fuse --min-confidence 0" in told

@@ -233,7 +233,7 @@ def test_missing_maps_are_told(filled: tuple[Path, Path], run: Run) -> None:
     (folder / "depth" / "1.png").unlink()
     result = run("page", capture, folder)
     assert result.code == 0 and result.warnings == ["1 of 4 maps are missing: 1"]
-    assert "1 maps are missing" in data_of(folder)["notes"][0]
+    assert "1 map missing" in data_of(folder)["notes"][0]
 
 
 @pytest.mark.parametrize("name", ["depth/2.png", "confidence/2.png", "points/2.ply"])
@@ -245,7 +245,7 @@ def test_a_damaged_file_is_named_and_the_page_stays(
     (folder / "index.html").write_text("as it was")
     file = folder / name
     file.write_bytes(content if isinstance(content, bytes) else file.read_bytes()[:content])
-    assert_one_line(run("page", capture, folder), name)
+    assert_one_line(run("page", capture, folder), name, "remove it")
     assert (folder / "index.html").read_text() == "as it was"
 
 
