@@ -38,14 +38,14 @@ def _of_pixels(depth: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
     # What is unknown agrees with nothing that is known.
     log_depth = torch.where(known, depth.log(), NOWHERE)
     precision = torch.where(known, deviation.clamp_min(0.01) ** -2, 0.0)
-    weighted = precision * log_depth
+    summed = torch.stack([precision, precision * log_depth, torch.ones_like(precision)])
     best, mean = torch.zeros_like(depth[0]), torch.zeros_like(depth[0])
     for said in log_depth:
-        agree = (log_depth - said).abs_() < TOLERANCE
-        total = (precision * agree).sum(dim=0)
-        better = (agree.sum(dim=0) >= LEAST) & (total > best)
+        agree = ((log_depth - said).abs_() < TOLERANCE).to(depth)
+        total, weighted, count = (summed * agree).sum(dim=1)
+        better = (count >= LEAST) & (total > best)
         best = torch.where(better, total, best)
-        mean = torch.where(better, (weighted * agree).sum(dim=0) / total.clamp_min(1e-9), mean)
+        mean = torch.where(better, weighted / total.clamp_min(1e-9), mean)
     near = precision * ((log_depth - mean).abs() < TOLERANCE)
     total = near.sum(dim=0).clamp_min(1e-9)
     spread = (near * (log_depth - mean).square()).sum(dim=0) / total

@@ -72,12 +72,12 @@ class SecondPass:
         heard = [self._read(near) for near in self._around[id]]
         seen = [
             seen_from(
-                KnownDepth(*(part[None] for part in other.map)),
-                other.view,
+                KnownDepth(*(torch.stack(parts) for parts in zip(*alike[0], strict=True))),
+                PosedViews(*(torch.cat(parts) for parts in zip(*alike[1], strict=True))),
                 own.view,
                 image_size=size,
             )
-            for other in heard
+            for alike in _by_size(heard)
         ]
         found = own.map
         if seen:
@@ -100,3 +100,13 @@ class SecondPass:
         K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
         view = PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
         return _First(found, view, record)
+
+
+def _by_size(heard: Sequence[_First]) -> list[tuple[list[KnownDepth], list[PosedViews]]]:
+    """Maps and cameras, those of one size together: mostly all of them."""
+    groups: dict[torch.Size, tuple[list[KnownDepth], list[PosedViews]]] = {}
+    for other in heard:
+        maps, views = groups.setdefault(other.map.depth.shape, ([], []))
+        maps.append(other.map)
+        views.append(other.view)
+    return list(groups.values())
