@@ -25,21 +25,22 @@ def agreed(own: KnownDepth, others: KnownDepth) -> KnownDepth:
     """
     everyone = zip(own, others, strict=True)
     told = consensus(KnownDepth(*(torch.cat([mine[None], theirs]) for mine, theirs in everyone)))
-    known = (told.depth > 0) & ~_edges(own.depth)
+    there = own.depth > 0
+    log_depth = torch.where(there, own.depth, 1.0).log()
+    known = (told.depth > 0) & ~(there & _edges(log_depth))
     if not known.any():
         return own
-    points = as_points(KnownDepth(torch.where(known, told.depth, 0.0)[None], told.deviation[None]))
-    log_depth = own.depth.log()
+    both = torch.where(known & there, told.depth, 0.0)
+    points = as_points(KnownDepth(both[None], told.deviation[None]))
     process = correction(points, told.deviation[None].square(), log_depth[None], most=MOST)
     depth = torch.where(known, told.depth, own.depth).flatten()
-    left = (~known).flatten().nonzero()[:, 0]
+    left = (there & ~known).flatten().nonzero()[:, 0]
     depth[left] *= _correction_at(process, left, log_depth).exp()
     deviation = torch.where(known, told.deviation, own.deviation)
     return KnownDepth(depth.view(own.depth.shape), deviation)
 
 
-def _edges(depth: Tensor) -> Tensor:
-    log_depth = depth.log()
+def _edges(log_depth: Tensor) -> Tensor:
     highest = F.max_pool2d(log_depth, 5, stride=1, padding=2)
     lowest = -F.max_pool2d(-log_depth, 5, stride=1, padding=2)
     return highest - lowest > EDGE

@@ -98,6 +98,18 @@ def test_a_map_takes_what_three_others_say_and_moves_the_rest_as_they_would() ->
     assert_close(found.deviation[..., 20:], own.deviation[..., 20:])
 
 
+def test_holes_of_a_map_are_filled_or_stay_holes() -> None:
+    truth = wall(camera(0))
+    depth = truth[0] * 1.2
+    depth[..., 5:15, 5:15], depth[..., 5:15, 22:32] = 0, 0
+    others = truth.repeat(3, 1, 1, 1)
+    others[..., 20:] = 0
+    found = agreed(KnownDepth(depth, torch.full_like(depth, 0.1)), sure(others))
+    assert found.depth.isfinite().all() and found.deviation.isfinite().all()
+    assert_close(found.depth[..., 5:15, 5:15], truth[0, ..., 5:15, 5:15])
+    assert not found.depth[..., 5:15, 22:32].any()
+
+
 def test_a_map_that_nobody_sees_stays() -> None:
     own = sure(wall(camera(0))[0])
     nothing = KnownDepth(torch.zeros(2, 1, *SIZE).double(), torch.zeros(2, 1, *SIZE).double())
