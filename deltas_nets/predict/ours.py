@@ -13,6 +13,7 @@ from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import anchor_views, fit_work_size
 from deltas_nets.config import to_dict
+from deltas_nets.config.varied import NetworkSettings, varied_config
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas, DepthPrediction, with_batch_dims
 from deltas_nets.network.known_depth import KnownDepth
@@ -24,6 +25,7 @@ from deltas_nets.predict.depth_map import (
     keypoint_depths,
 )
 from deltas_nets.predict.encoded_frames import EncodedFrames
+from deltas_nets.predict.without_points import map_without_points
 from deltas_nets.weights_file import weights_record
 
 WORK_PIXELS = 120_000
@@ -53,12 +55,23 @@ class DeltasPredictor:
 
     Args:
         model: trained, on any device; its weights must not change meanwhile.
+        without_points: whether its maps rest on the anchor's image alone.
     """
 
     states_confidence = True
 
-    def __init__(self, model: Deltas) -> None:
+    def __init__(self, model: Deltas, *, without_points: bool = False) -> None:
         self.encode = EncodedFrames(model)
+        self.without_points = without_points
+
+    def varied(self, settings: NetworkSettings) -> "DeltasPredictor":
+        """The same weights in a network of another config."""
+        model = self.encode.model
+        other = Deltas(varied_config(model.config, settings)).to(model.dtype)
+        other.load_state_dict(model.state_dict(), assign=True)
+        asked = settings.num_points
+        without = self.without_points if asked is None else asked == 0
+        return DeltasPredictor(other.eval(), without_points=without)
 
     def check_asked(
         self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
@@ -72,8 +85,11 @@ class DeltasPredictor:
         measured: MeasuredDepth | None = None,
     ) -> DepthMap:
         """Depth of the first frame from all of them, and from what was measured."""
-        if len(frames) == 1:
+        if len(frames) == 1 or (self.without_points and measured is not None):
             return complete_frame(self.encode, frames[0], config, measured)
+        if self.without_points:
+            size = work_size_of(frames[0], config)
+            return map_without_points(self.encode, frames[0], config, work_size=size)
         return predict_frame(self.encode, frames, config, measured).map
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
@@ -82,7 +98,8 @@ class DeltasPredictor:
 
     def network_record(self) -> dict[str, Any]:
         """Its config."""
-        return to_dict(self.encode.model.config)
+        record = to_dict(self.encode.model.config)
+        return record | {"without_points": True} if self.without_points else record
 
     def weights_record(self, name_or_file: str) -> dict[str, str]:
         """What the weights file says of itself."""

@@ -11,6 +11,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig
@@ -58,6 +59,13 @@ class Predictor(Protocol):
         Raises:
             UserError: an image cannot be read; the network does not take measured depth, or there
                 is neither a source nor such depth.
+        """
+
+    def varied(self, settings: NetworkSettings) -> "Predictor":
+        """The same weights under other numbers of the supplement.
+
+        Raises:
+            UserError: the network has no such setting (:meth:`NetworkSettings.check_known`).
         """
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:

@@ -6,6 +6,7 @@ published weights saw them; one camera matrix stands for all views. The network 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import SMALLEST_BASELINE
+from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.detector import CELL
@@ -33,6 +35,7 @@ from deltas_nets.predict.depth_map import (
 )
 from deltas_nets.reference import ReferenceNetwork, evaluation_input
 from deltas_nets.reference.segments import FAR, NEAR
+from deltas_nets.reference.settings import PUBLISHED
 from deltas_nets.weights_file import sha256_of, weights_file
 
 DEPTH_RANGE = (NEAR, FAR)
@@ -81,12 +84,18 @@ class ReferencePredictor:
 
     Args:
         network: from :func:`deltas_nets.reference.load`, on any device.
+        settings: what the supplement varies.
     """
 
     states_confidence = False
 
-    def __init__(self, network: ReferenceNetwork) -> None:
+    def __init__(self, network: ReferenceNetwork, settings: NetworkSettings = PUBLISHED) -> None:
         self.network = network
+        self.settings = settings
+
+    def varied(self, settings: NetworkSettings) -> "ReferencePredictor":
+        """It has all of them."""
+        return ReferencePredictor(self.network, replace(self.settings, **settings.given()))
 
     def check_asked(
         self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
@@ -114,7 +123,7 @@ class ReferencePredictor:
             what = "the reference network takes no measured depth, and looks at two views or more"
             raise UserError(what, "--sensor-depth", "leave it out")
         work_size = config.work_size or WORK_SIZE
-        found = predict_reference(self.network, frames, work_size=work_size)
+        found = predict_reference(self.network, frames, work_size=work_size, settings=self.settings)
         size = config.size or frames[0].image_size
         depth = np.maximum(resized(found.depth, size), 0)  # below 0 it is no depth
         points, colors = point_cloud(frames[0], depth, size, work_size)
@@ -126,8 +135,9 @@ class ReferencePredictor:
         raise UserError(refusal, where, remedy)
 
     def network_record(self) -> dict[str, Any]:
-        """Its name in records."""
-        return {"name": "published"}
+        """Its name in records, and what its program did not have."""
+        other = self.settings.given().items() - PUBLISHED.given().items()
+        return {"name": "published", **dict(sorted(other))}
 
     def weights_record(self, name_or_file: str) -> dict[str, str]:
         """The file's fingerprint."""
@@ -156,7 +166,11 @@ def check_cameras(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> Non
 
 
 def predict_reference(
-    network: ReferenceNetwork, frames: Sequence[Frame], *, work_size: tuple[int, int] = WORK_SIZE
+    network: ReferenceNetwork,
+    frames: Sequence[Frame],
+    *,
+    work_size: tuple[int, int] = WORK_SIZE,
+    settings: NetworkSettings = PUBLISHED,
 ) -> ReferenceDepth:
     """Depth of the first frame from all of them.
 
@@ -164,6 +178,7 @@ def predict_reference(
         network: from :func:`deltas_nets.reference.load`, on any device.
         frames: the anchor and its sources, of one camera (:func:`check_cameras`).
         work_size: (height, width) that the network sees, multiples of 8.
+        settings: what the supplement varies.
 
     Raises:
         UserError: an image cannot be read.
@@ -172,7 +187,7 @@ def predict_reference(
     device = next(network.parameters()).device
     given = ReferenceInput(*(part.to(device) for part in load_input(frames, work_size)))
     generator = torch.Generator().manual_seed(SEED)
-    prediction = network.predict(*given, generator=generator)
+    prediction = network.predict(*given, settings=settings, generator=generator)
     matched = prediction.matched
     z = matched.points_3d[0, :, 2]
     used = (matched.in_range != 0).any(dim=1)[0] & (z > NEAR) & (z < FAR)

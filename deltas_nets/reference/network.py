@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from deltas_geom import PosedViews
 from deltas_geom.cameras.poses import relative_pose
 from deltas_geom.checks import ShapeError
+from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.network.lite.detector import CELL
 from deltas_nets.network.paper.resnet import ResNet50
 from deltas_nets.network.paper.sparse_densifier import (
@@ -33,7 +34,13 @@ from deltas_nets.reference.outputs import (
 from deltas_nets.reference.points import draw_sparse_depth, triangulate_pixels
 from deltas_nets.reference.precision import full_precision
 from deltas_nets.reference.scores import MatchNorm, correlate_samples, read_matches
-from deltas_nets.reference.segments import reference_segments, segment_samples
+from deltas_nets.reference.segments import (
+    NUM_SAMPLES,
+    OFFSET,
+    reference_segments,
+    segment_samples,
+)
+from deltas_nets.reference.settings import PUBLISHED
 
 Indices = Tensor | Sequence[int]
 
@@ -121,6 +128,8 @@ class ReferenceNetwork(nn.Module):
         cam_from_anchor: Tensor,
         *,
         probe_points: Indices = (),
+        num_samples: int = NUM_SAMPLES,
+        offset: float = OFFSET,
     ) -> MatchOutputs:
         """Match and triangulate the anchors' key points.
 
@@ -131,6 +140,8 @@ class ReferenceNetwork(nn.Module):
             intrinsics: ``(B, 3, 3)``, the same for all views.
             cam_from_anchor: ``(B, V, 4, 4)`` of the sources, metres.
             probe_points: P indices of key points to show in detail.
+            num_samples: along a segment.
+            offset: of the lines beside the epipolar line, pixels.
 
         Raises:
             ShapeError: a shape differs.
@@ -140,11 +151,11 @@ class ReferenceNetwork(nn.Module):
         probe = torch.as_tensor(probe_points, dtype=torch.long, device=keypoints.device)
         with full_precision(keypoints.device):
             segments = reference_segments(keypoints, intrinsics, cam_from_anchor, image_size=size)
-            samples = segment_samples(segments)
+            samples = segment_samples(segments, num_samples=num_samples, offset=offset)
             maps = descriptors.view(1 + views, batch, *descriptors.shape[1:]).transpose(0, 1)
             correlation = correlate_samples(maps, keypoints, samples)
             scores = self.match_norm(correlation)
-            matches = read_matches(scores, segments)
+            matches = read_matches(scores, segments, offset=offset)
             weights = F.pad(matches.weights, (0, 0, 1, 0), value=1.0)  # the anchor's is 1
             pixels = torch.cat([keypoints[:, None], matches.pixels], dim=1)
             points = triangulate_pixels(pixels, weights, intrinsics, cam_from_anchor)
@@ -260,7 +271,7 @@ class ReferenceNetwork(nn.Module):
             images,
             views.K[:1],
             relative_pose(poses[1:], poses[:1])[None],
-            num_points=num_keypoints,
+            settings=NetworkSettings(num_points=num_keypoints),
             generator=torch.Generator().manual_seed(0),
         )
 
@@ -271,7 +282,7 @@ class ReferenceNetwork(nn.Module):
         intrinsics: Tensor,
         cam_from_anchor: Tensor,
         *,
-        num_points: int = 512,
+        settings: NetworkSettings = PUBLISHED,
         generator: torch.Generator | None = None,
     ) -> ReferencePrediction:
         """Depth of one anchor, with key points as the original picks them.
@@ -281,16 +292,30 @@ class ReferenceNetwork(nn.Module):
                 with what :func:`~deltas_nets.reference.evaluation_input` gives.
             intrinsics: ``(1, 3, 3)``, the same for all views.
             cam_from_anchor: ``(1, V, 4, 4)`` of the sources, metres.
-            num_points: key points in all.
+            settings: what is not given is as in :data:`PUBLISHED`.
             generator: of the random ones; on the CPU, whatever the device of the images.
 
         Raises:
             ShapeError: a shape differs, or there is more than one anchor.
         """
+        given = PUBLISHED.given() | settings.given()
         features = self.features(images)
-        detected = self.pick(features.detector.logits[0], num_points=num_points)
-        xy, score = fill_keypoints(detected, num_points=num_points, generator=generator)
-        matched = self.match(features.descriptor.unit, xy[None], intrinsics, cam_from_anchor)
+        detected = self.pick(
+            features.detector.logits[0],
+            num_points=given["num_points"],
+            radius=given["nms_radius"],
+            threshold=given["threshold"],
+            fraction=given["detected_share"],
+        )
+        xy, score = fill_keypoints(detected, num_points=given["num_points"], generator=generator)
+        matched = self.match(
+            features.descriptor.unit,
+            xy[None],
+            intrinsics,
+            cam_from_anchor,
+            num_samples=given["num_samples"],
+            offset=given["offset"],
+        )
         densified = self.densify(
             features.taps.of_first(1), xy[None], matched.points_3d, matched.in_range
         )

@@ -6,12 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from deltas_nets.reference.segments import (
-    NUM_SAMPLES,
-    OFFSETS,
-    ReferenceSegments,
-    place_on_segments,
-)
+from deltas_nets.reference.segments import OFFSET, ReferenceSegments, place_on_segments
 
 _WEIGHT_FLOOR = 0.001
 
@@ -42,12 +37,12 @@ class ReferenceMatches(NamedTuple):
 
 
 def correlate_samples(descriptors: Tensor, keypoints: Tensor, samples: Tensor) -> Tensor:
-    """Correlation ``(B, V, N, 3, 100)`` of the key points with the samples.
+    """Correlation ``(B, V, N, 3, S)`` of the key points with the samples.
 
     Args:
         descriptors: ``(B, 1 + V, D, h, w)`` of unit length, the anchor first.
         keypoints: ``(B, N, 2)`` pixels of the anchor.
-        samples: ``(B, V, N, 3, 100, 2)`` pixels of the sources.
+        samples: ``(B, V, N, 3, S, 2)`` pixels of the sources.
     """
     template = sample_descriptors(descriptors[:, 0], keypoints[:, :, None]).squeeze(-1)  # (B, D, N)
     maps = []
@@ -77,21 +72,25 @@ def sample_descriptors(feature: Tensor, pixels: Tensor) -> Tensor:
     return F.normalize(read, dim=1)
 
 
-def read_matches(scores: Tensor, segments: ReferenceSegments) -> ReferenceMatches:
+def read_matches(
+    scores: Tensor, segments: ReferenceSegments, *, offset: float = OFFSET
+) -> ReferenceMatches:
     """Centre of mass of every score map, and its maximum as a weight.
 
     Args:
-        scores: ``(B, V, N, 3, 100)``, not negative.
+        scores: ``(B, V, N, 3, S)``, not negative.
         segments: where they were sampled.
+        offset: of the lines beside the epipolar line, pixels.
     """
+    num_lines, num_samples = scores.shape[-2:]
     probability = scores.flatten(-2).softmax(dim=-1).view_as(scores)
-    columns = torch.arange(NUM_SAMPLES, device=scores.device, dtype=scores.dtype)
-    rows = torch.arange(len(OFFSETS), device=scores.device, dtype=scores.dtype)
+    columns = torch.arange(num_samples, device=scores.device, dtype=scores.dtype)
+    rows = torch.arange(num_lines, device=scores.device, dtype=scores.dtype)
     column = (probability.sum(dim=-2) * columns).sum(dim=-1)
     row = (probability.sum(dim=-1) * rows).sum(dim=-1)
-    along = segments.length * (column / (NUM_SAMPLES - 1) - 0.5)
-    # The samples lie up to 1 pixel across the line, the match only up to 0.5.
-    across = row / (len(OFFSETS) - 1) - 0.5
+    along = segments.length * (column / (num_samples - 1) - 0.5)
+    # The samples lie up to the offset across the line, the match only up to half of it.
+    across = offset * (row / (num_lines - 1) - 0.5)
     pixels = place_on_segments(segments.angle, segments.center, along, across)
     has_length = segments.length > 0
     certainty = scores.flatten(-2).amax(dim=-1).sigmoid()

@@ -15,8 +15,8 @@ NEAR, FAR = 0.5, 10.0
 """Depth range that is searched, metres."""
 NUM_SAMPLES = 100
 """Samples along a segment."""
-OFFSETS = (-1.0, 0.0, 1.0)
-"""Lines searched beside the epipolar line, pixels across it."""
+OFFSET = 1.0
+"""Lines this far on either side of the epipolar line are searched too, pixels."""
 
 
 class ReferenceSegments(NamedTuple):
@@ -65,15 +65,23 @@ def reference_segments(
     return ReferenceSegments(near, far, length > 0, (start + end) / 2, length, torch.atan2(-a, b))
 
 
-def segment_samples(segments: ReferenceSegments) -> Tensor:
-    """Positions ``(B, V, N, 3, 100, 2)`` of the samples, one row for each offset."""
+def segment_samples(
+    segments: ReferenceSegments, *, num_samples: int = NUM_SAMPLES, offset: float = OFFSET
+) -> Tensor:
+    """Positions ``(B, V, N, 3, S, 2)`` of the samples, one row for each line.
+
+    Args:
+        segments: where to search.
+        num_samples: S along each line.
+        offset: of the lines beside the epipolar line, pixels.
+    """
     center = segments.center
-    along = torch.linspace(-0.5, 0.5, NUM_SAMPLES, device=center.device, dtype=center.dtype)
+    along = torch.linspace(-0.5, 0.5, num_samples, device=center.device, dtype=center.dtype)
     return place_on_segments(
         segments.angle[..., None, None],
         center[..., None, None, :],
         segments.length[..., None, None] * along,
-        center.new_tensor(OFFSETS)[:, None],
+        center.new_tensor((-offset, 0.0, offset))[:, None],
     )
 
 

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 
 from deltas_geom.checks import ShapeError
 from deltas_nets import reference
+from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
 from deltas_nets.reference import ReferenceNetwork
 from deltas_nets.reference.checkpoint import ENTRIES
@@ -185,7 +186,7 @@ def test_a_prediction_is_repeatable_and_has_all_its_points(
             images,
             cameras[0][:1],
             cameras[1][:1],
-            num_points=32,
+            settings=NetworkSettings(num_points=32),
             generator=torch.Generator().manual_seed(5),
         )
         for _ in range(2)
