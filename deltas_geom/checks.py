@@ -40,12 +40,13 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
             check_tensor(**{name: tensor})
             if name not in ("mask", "used") and not name.endswith("_index"):
                 check_floating(**{name: tensor})
-        dims, shape = spec.replace("+", "").split(), tensor.shape
-        tail = shape[-len(dims) :]
+        dims = spec.replace("+", "").split()
+        tail = tensor.shape[-len(dims) :]
         fits = len(tail) == len(dims)
         for dim, size in zip(dims, tail, strict=False):
-            fits = fits and size == (_NUMBERS.get(dim) or sizes.setdefault(dim, size))
-            fits = fits and (size > 0 or f"+{dim}" not in spec)
+            wanted = _NUMBERS.get(dim) or sizes.setdefault(dim, size)
+            if size != wanted or (size == 0 and f"+{dim}" in spec):
+                fits = False
         if not fits:
             raise ShapeError(_misfit(named, name, sizes))
 

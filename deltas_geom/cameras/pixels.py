@@ -4,11 +4,13 @@ Everything that knows how a pixel becomes a `grid_sample` coordinate, a pixel of
 or cropped image, or a place in a feature map is here and nowhere else.
 """
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_image_size, check_shapes
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 
 
 def pixel_grid(
@@ -64,15 +66,29 @@ def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     check_shapes(pixels=(pixels, "2"))
     at_zero, slope = normalizing(image_size, like=pixels)
     grid = torch.addcmul(at_zero, pixels, slope)
-    return grid.nan_to_num(nan=-1.0, posinf=1.0, neginf=-1.0)
+    return grid.nan_to_num_(nan=-1.0, posinf=1.0, neginf=-1.0)
 
 
 def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
     """What :func:`normalize_pixels` gives to pixel (0, 0), and its slope, each ``(2,)``."""
-    height, width = image_size
+    if values_at_hand(like):
+        return _kept_normalizing(*image_size, like.dtype)
+    return _normalizing(*image_size, like.device, like.dtype)
+
+
+@lru_cache(maxsize=64)
+def _kept_normalizing(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """The same on the CPU, where to make four numbers takes longer than to use them."""
+    with torch.inference_mode(False):  # whose tensors no later gradient could use
+        return _normalizing(height, width, torch.device("cpu"), dtype)
+
+
+def _normalizing(
+    height: int, width: int, device: torch.device, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
     # Not torch.tensor, which copies numbers of the host to the device and waits for them.
-    slope = torch.linspace(2 / width, 2 / height, 2, device=like.device, dtype=like.dtype)
-    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=like.device, dtype=like.dtype)
+    slope = torch.linspace(2 / width, 2 / height, 2, device=device, dtype=dtype)
+    at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=device, dtype=dtype)
     return at_zero, slope
 
 

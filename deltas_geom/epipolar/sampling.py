@@ -71,28 +71,32 @@ def sample_segments(
         foreshortening=(segments.foreshortening, "S N"),
     )
     *ends, low, high, _, ratio = segments
-    parts = [*ends, *(each[..., None] for each in (low, high, ratio))]
+    parts = [*ends, *(each.unsqueeze(-1) for each in (low, high, ratio))]
     known, sound = finite_or_zero(torch.cat(parts, dim=-1))
     if sound is not None:
         parts = list(known.split_with_sizes([2, 2, 1, 1, 1], dim=-1))
     start, end, low, high, ratio = parts
-    fraction = torch.linspace(0, 1, num_samples, device=start.device, dtype=start.dtype)
+    fraction, rest = (
+        torch.linspace(end, 1 - end, num_samples, device=start.device, dtype=start.dtype)
+        for end in (0, 1)
+    )
     # Homogeneous interpolation: with r the foreshortening, a share s of the inverse depth
     # lies at the share s r / (1 - s + s r) of the pixels.
     ratio = only(ratio, sound, other=1.0)
     if spacing == "inv_depth":
         of_depth, nearer = fraction, fraction * ratio
-        of_pixels = nearer / (1 - fraction + nearer)
+        of_pixels = nearer / (rest + nearer)
     elif spacing == "pixels":
-        of_depth, of_pixels = fraction / (ratio * (1 - fraction) + fraction), fraction
+        of_depth, of_pixels = fraction / (ratio * rest + fraction), fraction
     else:
         raise ValueError(f"spacing must be 'inv_depth' or 'pixels', got {spacing!r}")
-    inv_depth = low + of_depth * (high - low)
-    pixels = start[..., None, :] + of_pixels[..., None] * (end - start)[..., None, :]
+    along = end - start
+    # Not a product and a sum, which take five times as long where there are many samples.
+    inv_depth = torch.addcmul(low, of_depth, high - low)
+    pixels = torch.addcmul(start.unsqueeze(-2), of_pixels.unsqueeze(-1), along.unsqueeze(-2))
 
     pixels = pixels.unsqueeze(-3)
     if offsets:
-        along = end - start
         length = along.square().sum(-1, keepdim=True)
         moving = length > 0
         unit = along * torch.where(moving, length, 1.0).rsqrt()
@@ -100,8 +104,8 @@ def sample_segments(
         # Not torch.tensor, which copies numbers of the host to the device and waits for them.
         shifts = torch.stack([start.new_full((), offset) for offset in offsets])
         pixels = pixels + shifts[:, None, None] * across[..., None, None, :]
-    mask = only(segments.visible[..., None], sound, other=False)
-    mask = mask[..., None].expand(pixels.shape[:-1])
+    mask = only(segments.visible.unsqueeze(-1), sound, other=False)
+    mask = mask.unsqueeze(-1).expand(pixels.shape[:-1])
     if image_size is not None:
         check_image_size(image_size)
         mask = mask & in_image(pixels, image_size=image_size)

@@ -1,6 +1,6 @@
 """The precision that arguments are worked on in, and numbers that are none."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial, reduce, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -118,16 +118,15 @@ def _called(
 ) -> Callable[_Arguments, _Result]:
     @wraps(operation)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        tensors = tensors_of((*args, *kwargs.values()))
         # Asked first: an exported program that holds a region without autocast cannot be loaded.
         if torch.compiler.is_compiling() or torch._C._is_any_autocast_enabled():
-            kind = tensors[0].device.type if tensors else "meta"
+            kind = next((x.device.type for x in tensors_of((*args, *kwargs.values()))), "meta")
             if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
                 with torch.autocast(kind, enabled=False):
                     return called(*args, **kwargs)
-        # A list, and no generator: this is a third of the time of the smallest operations.
-        if not any([tensor.dtype in _HALF for tensor in tensors]):
+        if not (_any_half(args) or _any_half(kwargs.values())):
             return operation(*args, **kwargs)
+        tensors = tensors_of((*args, *kwargs.values()))
         options: Any = {name: mapped(_widened, value) for name, value in kwargs.items()}
         result = operation(*mapped(_widened, args), **options)
         kinds = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]
@@ -136,6 +135,17 @@ def _called(
         return mapped(partial(_rounded, dtype=dtype), result, "covariance") if half else result
 
     return called
+
+
+def _any_half(values: Iterable[Any]) -> bool:
+    """Is any tensor in a nest of tuples of half precision? No list of them, which takes longer."""
+    for value in values:
+        if isinstance(value, Tensor):
+            if value.dtype in _HALF:
+                return True
+        elif isinstance(value, tuple) and _any_half(value):
+            return True
+    return False
 
 
 def _widened(tensor: Tensor) -> Tensor:
