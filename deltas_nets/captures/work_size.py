@@ -17,6 +17,7 @@ __all__ = [
     "fit_work_size",
     "load_image",
     "load_views",
+    "sensor_at_image",
 ]
 
 SMALLEST_BASELINE = 1e-6
@@ -131,7 +132,13 @@ def depth_at_image(
     Raises:
         UserError: the frame has no depth, or it cannot be read.
     """
-    depth = frame.read_depth()
+    return sensor_at_image(frame, frame.read_depth(), work_size=work_size)
+
+
+def sensor_at_image(
+    frame: Frame, depth: NDArray[np.float32], *, work_size: tuple[int, int] | None = None
+) -> NDArray[np.float32]:
+    """What :func:`depth_at_image` makes of a frame's sensor depth ``(h, w)`` that was read."""
     depth_size = (depth.shape[0], depth.shape[1])
     height, width = size = frame.image_size if work_size is None else work_size
     image_K = torch.from_numpy(frame.K.copy())

@@ -1,123 +1,207 @@
 """The command `deltas evaluate`."""
 
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from deltas_nets.commands.flags import Prediction
+from deltas_nets.commands.flags import Flag, Prediction, usable_device
+from deltas_nets.commands.values import at_least_one
+from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, warn
+from deltas_nets.terminal import counted, progress, warn
 
 if TYPE_CHECKING:
-    from deltas_nets.evaluate.scores import CaptureScores
+    from deltas_nets.evaluate.dataset import DatasetScores
+    from deltas_nets.evaluate.protocols.view_protocol import ViewProtocol
+    from deltas_nets.predict.predictor import Predictor
 
 
 @dataclass(frozen=True)
 class Evaluate(Prediction):
-    """Score depth against a capture's sensor depth, or on rooms: the paper's metrics.
+    """Score depth against sensor depth, of one scene or many, or on rooms: the paper's metrics.
 
     Of networks that state a standard deviation also: how much smaller the error of the half of each
-    map is that is most certain, and predicted against true errors.
+    map is that is most certain, and predicted against true errors. What fails is counted and named,
+    and the exit code is 1 then. docs/evaluation.md has the protocols and the metrics.
 
     Example: deltas evaluate my_capture --views 3 --json scores.json
     """
 
-    capture: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[CAPTURE]")] = (
-        field(default=None, kw_only=True)
-    )
-    """Folder with images, poses, intrinsics and depth/N.png."""
+    captures: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[CAPTURE ...]")
+    ] = field(default=(), kw_only=True)
+    """Folders with images, poses, intrinsics and depth/N.png, or folders of such scenes."""
+    scenes: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A scene on each line, relative to the folder that is named, or to the file's."""
+    data: Annotated[Literal["scannet"] | None, tyro.conf.arg(metavar="scannet")] = None
+    """The folder that is named holds ScanNet; --split says which of its scenes."""
+    split: Annotated[str, tyro.conf.arg(metavar="NAME-OR-FILE")] = "test"
+    """Of --data scannet: test (scene0707 to scene0806), train, all, or a file of names."""
     rooms: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Instead of a capture: the first N, at most 500, of the procedural rooms that neither training
     nor calibration sees, at --work-size, 288 384 if not given."""
     conditions: Literal["ideal", "real"] = "real"
     """Of rooms: ideal is as rendered, real has blur, noise and usual pose errors."""
+    protocol: Literal["chosen", "paper", "deepvideomvs"] = "chosen"
+    """Which views go together: as deltas depth chooses; the paper's sequences of a fixed gap;
+    DeepVideoMVS's key frames."""
     view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen if not given."""
+    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; of several scenes, a file in each."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Views per depth map, the anchor included; 3 of rooms if not given."""
+    """Views per depth map, the anchor included; 3 of rooms and protocols if not given."""
+    gap: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Of --protocol paper: frames from one view to the next; the paper's for its number of views if
+    not given (20 for 2 and 3, 15, 12, 10 for 4, 5, 7)."""
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 20
+    """Of --protocol paper: anchors are frames whose number it divides."""
+    settings: Annotated[NetworkSettings, tyro.conf.arg(name="")] = field(
+        default_factory=NetworkSettings
+    )
+    """What the paper's supplement varies."""
     predictions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Score the maps that `deltas depth` wrote here instead of predicting."""
+    """Score the maps that `deltas depth` wrote here instead of predicting; of several scenes, in a
+    folder for each."""
+    truth_size: Literal["map", "own"] = "map"
+    """Score at the pixels of the map, or at the sensor's own, which are the same for maps of any
+    size."""
+    consistency: Flag = False
+    """Also compare the maps of a scene with each other."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write the scores to this file."""
+    """Also write everything to this file."""
+    csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write a row for each frame to this file."""
+
+    # A file of view sets may lie in each scene, and is looked for once these are known.
+    checks: ClassVar[Mapping[str, Callable[[Any, str], object]]] = {
+        "gap": at_least_one,
+        "every": at_least_one,
+        "view_sets": lambda value, flag: None,
+    }
 
     def run(self) -> None:
         """Run the command."""
-        from rich.console import Console
+        from deltas_nets.outputs.atomic_files import check_writable
 
-        from deltas_nets.evaluate.report import (
-            calibration_table,
-            metrics_table,
-            scores_as_json,
-            scores_by_name,
-            sparsification_line,
-        )
-        from deltas_nets.outputs.atomic_files import check_writable, write_json
+        self._check_what()
+        for file in (self.json, self.csv):
+            if file is not None:
+                check_writable(file.parent)
+        scores, title = self._of_rooms() if self.rooms is not None else self._of_scenes()
+        self._print(scores, title)
+        self._write(scores)
+        if scores.failures:
+            failed = {**scores.total.failed, **scores.failed}
+            said = f"{counted(scores.failures, 'frame or scene')} failed; the first, "
+            warn(said + ": ".join(next(iter(failed.items()))))
+            sys.exit(1)
 
-        if self.capture is None and self.rooms is None:
-            raise UserError("score what?", "command line", "give a capture, or --rooms N")
-        if self.capture is not None and self.rooms is not None:
+    def _check_what(self) -> None:
+        """Refuse flags that contradict each other."""
+        where = "command line"
+        if not self.captures and self.scenes is None and self.rooms is None:
+            raise UserError("score what?", where, "give a capture, or --rooms N")
+        if (self.captures or self.scenes is not None) and self.rooms is not None:
             what = "a capture and rooms are not scored together"
-            raise UserError(what, "command line", f"leave out --rooms or {self.capture}")
-        if self.json is not None:
-            check_writable(self.json.parent)
-        if self.capture is not None:
-            scores, title = self._of_capture(self.capture), f"{self.capture}: "
-        else:
-            scores, title = self._of_rooms(self.rooms or 0), f"rooms, {self.conditions}: "
-        title += f"{len(scores.frames)} frames"
-        Console().print(metrics_table(scores_by_name(scores), title=title))
-        if scores.calibration is not None:
-            table = calibration_table(scores.calibration, title="relative errors of dense depth")
-            Console().print(table)
-            print(sparsification_line(scores.calibration))
-        if self.json is not None:
-            write_json(self.json, scores_as_json(scores))
+            raise UserError(what, where, f"leave out --rooms or {(*self.captures, '--scenes')[0]}")
+        if self.data is not None and (len(self.captures) != 1 or self.scenes is not None):
+            what = "a data set is one folder"
+            raise UserError(what, f"--data {self.data}", "name the folder that holds scans_test")
+        if self.protocol != "chosen" and self.view_sets is not None:
+            what = "view sets come from a file or by a protocol"
+            raise UserError(what, f"--protocol {self.protocol}", "leave out it or --view-sets")
+        if self.gap is not None and self.protocol != "paper":
+            raise UserError("no gap is kept", "--gap", "add --protocol paper")
+        if self.predictions is not None and self.settings.given():
+            what = "maps are there already, whatever the settings"
+            raise UserError(what, "--predictions", "leave it out, or the settings")
 
-    def _of_capture(self, path: Path) -> "CaptureScores":
-        from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.usable import (
-            check_all,
-            usable_view_sets,
-            warn_of,
-            with_depth_only,
-        )
-        from deltas_nets.evaluate.capture import evaluate_files, evaluate_network
-        from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_view_sets
+    def _of_scenes(self) -> tuple["DatasetScores", str]:
+        from deltas_nets.evaluate.dataset import evaluate_scenes
+        from deltas_nets.evaluate.scenes import named_scenes, scenes_of_split
+
+        if self.data is not None:
+            scenes = scenes_of_split(self.captures[0], self.split)
+        else:
+            scenes = named_scenes(self.captures, self.scenes)
+        many = len(scenes) > 1
+
+        def protocol(name: str, path: Path) -> "ViewProtocol":
+            return self._protocol(name, path, many=many)
+
+        scorer = self._scorer(many=many)
+        scores = evaluate_scenes(scenes, protocol, scorer, depth_range=self.range)
+        title = f"{len(scenes)} scenes" if many else str((*self.captures, *scenes.values())[0])
+        return scores, title
+
+    def _protocol(self, name: str, path: Path, *, many: bool) -> "ViewProtocol":
+        from deltas_nets.evaluate.protocols.view_protocol import ViewProtocol
+
+        file = self.view_sets
+        if file is not None and (many or not file.exists()):
+            file = path / file
+        predictions = self.predictions
+        if predictions is not None and many:
+            predictions = predictions / name
+        return ViewProtocol(self.protocol, self.views, self.gap, self.every, file, predictions)
+
+    def _scorer(self, *, many: bool) -> Any:
+        """What scores a scene: the network, or maps in files."""
+        from deltas_nets.captures.capture import Capture
+        from deltas_nets.evaluate.calibration import CalibrationMeter
+        from deltas_nets.evaluate.capture import Scoring, evaluate_files, evaluate_network
+        from deltas_nets.evaluate.protocols.view_protocol import SceneViews
+        from deltas_nets.evaluate.scores import CaptureScores
+        from deltas_nets.outputs.summary import SUMMARY, read_summary
 
         config = self.config()
-        capture = open_capture(path).remembering()
-        if self.predictions is not None and self.view_sets is None:
-            view_sets = recorded_view_sets(self.predictions)
-        else:
-            view_sets = usable_view_sets(capture, self.view_sets, self.views).view_sets
-        warn_of(capture, view_sets, self.view_sets or self.predictions, self.range)
-        view_sets = with_depth_only(capture, view_sets)
-        check_all(capture, view_sets, with_depth=True)
-        if self.predictions is not None:
-            settings = (read_summary(self.predictions / SUMMARY) or {}).get("settings", {})
-            if settings.get("sensor_depth", {}).get("from") == "sensor":
-                warn("the maps were made with the sensor depth that they are scored against")
-            return evaluate_files(self.predictions, capture, view_sets, depth_range=self.range)
-        predictor = self.predictor()
-        predictor.check_asked(config, capture, view_sets)
-        with progress("evaluate", len(view_sets)) as report:
-            return evaluate_network(predictor, capture, view_sets, config, report=report)
+        scoring = Scoring(self.range, self.truth_size, self.consistency)
+        predictor = None if self.predictions is not None else self.varied_predictor()
 
-    def _of_rooms(self, count: int) -> "CaptureScores":
+        def score(
+            name: str, capture: Capture, views: SceneViews, meter: CalibrationMeter
+        ) -> CaptureScores:
+            sets = views.view_sets
+            with progress(f"evaluate {name}" if many else "evaluate", len(sets)) as report:
+                if predictor is not None:
+                    predictor.check_asked(config, capture, sets)
+                    return evaluate_network(
+                        predictor, capture, sets, config, scoring, meter=meter, report=report
+                    )
+                assert self.predictions is not None
+                folder = self.predictions / name if many else self.predictions
+                said = (read_summary(folder / SUMMARY) or {}).get("settings", {})
+                if said.get("sensor_depth", {}).get("from") == "sensor":
+                    warn("the maps were made with the sensor depth that they are scored against")
+                return evaluate_files(folder, capture, sets, scoring=scoring, report=report)
+
+        return score
+
+    def varied_predictor(self) -> "Predictor":
+        """The network, under the settings that are given."""
+        return self.predictor().varied(self.settings)
+
+    def _of_rooms(self) -> tuple["DatasetScores", str]:
+        from deltas_nets.evaluate.dataset import DatasetScores
+        from deltas_nets.evaluate.protocols.view_protocol import VERSION, SceneViews
         from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
 
-        config, views = self.config(), self.views or 3
+        config, views, count = self.config(), self.views or 3, self.rooms or 0
         for given, name in ((self.view_sets, "--view-sets"), (self.predictions, "--predictions")):
             if given is not None:
                 raise UserError("rooms have none", name, "leave it out")
+        if self.protocol != "chosen" or self.consistency or self.truth_size != "map":
+            what = "rooms are sets of views, each by itself, with truth at every pixel"
+            raise UserError(what, "--rooms", "leave out --protocol, --consistency, --truth-size")
         if not 1 <= count <= len(EVALUATION_SEEDS):
             raise UserError(f"no {count} rooms", "--rooms", f"give 1 to {len(EVALUATION_SEEDS)}")
         if not 2 <= views <= 12:
             raise UserError(f"no rooms of {views} views", "--views", "give 2 to 12")
         what = "the reference network has one camera, and rooms have others"
-        model = self.predictor().deltas(what, self.weights, "name a capture")
+        model = self.varied_predictor().deltas(what, self.weights, "name a capture")
         rooms = held_out_rooms(
             count,
             EVALUATION_SEEDS,
@@ -126,4 +210,70 @@ class Evaluate(Prediction):
             conditions=self.conditions,
         )
         with progress("evaluate", count) as report:
-            return score_rooms(model, rooms, depth_range=self.range, report=report)
+            scores = score_rooms(model, rooms, depth_range=self.range, report=report)
+        rule = {"name": "rooms", "version": VERSION, "views": views, "conditions": self.conditions}
+        found = SceneViews((), rule)
+        return DatasetScores({"rooms": scores}, {"rooms": found}, {}, scores), (
+            f"rooms, {self.conditions}"
+        )
+
+    def _print(self, scores: "DatasetScores", title: str) -> None:
+        from rich.console import Console
+
+        from deltas_nets.evaluate import report
+
+        console, total = Console(), scores.total
+        if len(scores.scenes) + len(scores.failed) > 1:
+            console.print(report.scenes_table(scores, title="scenes, means over frames"))
+        title = f"{title}: {len(total.frames)} frames"
+        console.print(report.metrics_table(report.scores_by_name(total), title=title))
+        if total.calibration is not None:
+            heading = "relative errors of dense depth"
+            console.print(report.calibration_table(total.calibration, title=heading))
+            print(report.sparsification_line(total.calibration))
+        if total.ause is not None:
+            print(f"area under the sparsification error (AUSE, Abs Rel): {total.ause:.3f}")
+        for name, scene in scores.scenes.items():
+            if scene.consistency is not None:
+                line = report.consistency_line(scene.consistency)
+                print(f"{name}: {line}" if len(scores.scenes) > 1 else line)
+
+    def _write(self, scores: "DatasetScores") -> None:
+        from deltas_nets.evaluate.record import command_line
+        from deltas_nets.evaluate.results import How, write_csv, write_scores
+
+        if self.csv is not None:
+            write_csv(self.csv, scores)
+        if self.json is not None:
+            how = How(self._how(), command_line(), self._weights_record(scores), self._device())
+            write_scores(self.json, scores, how)
+
+    def _how(self) -> dict[str, Any]:
+        """What decides the figures besides data, views and weights."""
+        from deltas_nets.evaluate.results import METRICS_VERSION
+
+        given = {"settings": self.settings.given(), "precision": self.precision}
+        return {
+            "metrics_version": METRICS_VERSION,
+            "depth_range": list(self.range),
+            "truth_size": self.truth_size,
+            "alignments": "none; median; scale and shift by least squares in depth",
+            "work_size": None if self.work_size is None else list(self.work_size),
+            **({"predictions": "maps in files"} if self.predictions is not None else given),
+        }
+
+    def _weights_record(self, scores: "DatasetScores") -> dict[str, Any]:
+        from deltas_nets.outputs.summary import SUMMARY, read_summary
+
+        if self.predictions is None:
+            predictor = self.varied_predictor()
+            network = {"network": predictor.network_record()}
+            return {self.weights: network | predictor.weights_record(self.weights)}
+        folders = [self.predictions, *(self.predictions / name for name in scores.scenes)]
+        summaries = filter(None, (read_summary(folder / SUMMARY) for folder in folders))
+        settings = next(summaries, {}).get("settings", {})
+        said = {key: settings[key] for key in ("network", "weights") if key in settings}
+        return {self.predictions.name: said}
+
+    def _device(self) -> str:
+        return "cpu" if self.predictions is not None else usable_device(self.device)

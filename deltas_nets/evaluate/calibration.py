@@ -159,6 +159,12 @@ class CalibrationMeter:
         self._abs_rel += relative.mean(), relative[certain].mean()
         self._maps += 1
 
+    def take(self, other: "CalibrationMeter") -> None:
+        """Take in all maps of another meter."""
+        self._sums += other._sums
+        self._abs_rel += other._abs_rel
+        self._maps += other._maps
+
     @property
     def empty(self) -> bool:
         """No map had true depth in range."""

@@ -1,25 +1,51 @@
 """A capture's depth maps against its sensor depth."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.view_sets import ViewSet
-from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.captures.view_sets import ViewSet, check_frames
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
+from deltas_nets.evaluate.consistency import SeenMaps
 from deltas_nets.evaluate.points import score_keypoints
 from deltas_nets.evaluate.scores import CaptureScores as CaptureScores
 from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
 from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
+from deltas_nets.evaluate.truth import Truth, TruthSize
 from deltas_nets.outputs.depth_formats import read_depth_map
 from deltas_nets.outputs.summary import recorded_depth_scale
-from deltas_nets.predict.depth_map import PredictConfig, frames_of, resized
+from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, frames_of, resized
 from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """How maps are compared with the truth."""
+
+    depth_range: tuple[float, float] = (0.5, 10.0)
+    """(near, far) of the true depth that counts, metres."""
+    truth_size: TruthSize = "map"
+    """At which pixels; see `Truth`."""
+    consistency: bool = False
+    """Whether maps are compared with each other too."""
+
+
+class _Scored(NamedTuple):
+    """A map to be scored, and the points and the deviation that it comes with, if any."""
+
+    depth: Map
+    keypoints: KeypointDepths | None
+    relative_std: Map | None
 
 
 def evaluate_network(
@@ -27,36 +53,35 @@ def evaluate_network(
     capture: Capture,
     view_sets: Sequence[ViewSet],
     config: PredictConfig,
+    scoring: Scoring | None = None,
     *,
+    meter: CalibrationMeter | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> CaptureScores:
-    """Predict every view set and score it.
+    """Predict every view set and score it; what fails is counted, and the rest goes on.
 
     Args:
         predictor: of a trained network.
         capture: frames with sensor depth.
         view_sets: anchors and sources.
         config: as for prediction.
+        scoring: how; by default at the map's size, over the range that is searched.
+        meter: takes in all maps too, if given.
         report: called with the id of every finished frame.
 
     Raises:
-        UserError: an anchor has no sensor depth, or none of it is in range.
+        UserError: all frames fail, or no anchor has true depth in range.
     """
-    scores: dict[str, MapScores | None] = {}
-    meter = CalibrationMeter()
-    for views in view_sets:
-        anchor = capture.frame(views.anchor)
-        truth = depth_at_image(anchor)
-        found = look(predictor, frames_of(capture, views), config, Reach(*config.depth_range))
-        sparse = score_keypoints(found.keypoints, truth, config.depth_range)
-        scores[str(views.anchor)] = score_map(found.depth, truth, config.depth_range, sparse)
-        if found.log_std is not None:
-            size = (found.depth.shape[0], found.depth.shape[1])
-            relative_std = np.exp(resized(found.log_std, size))
-            true = resize_nearest(truth, size)
-            meter.add(found.depth, relative_std, true, depth_range=config.depth_range)
-        report(str(views.anchor))
-    return _mean(scores, capture.path, meter)
+    reach = Reach(*config.depth_range)
+
+    def predicted(views: ViewSet) -> _Scored:
+        found = look(predictor, frames_of(capture, views), config, reach)
+        size = (found.depth.shape[0], found.depth.shape[1])
+        std = None if found.log_std is None else np.exp(resized(found.log_std, size))
+        return _Scored(found.depth, found.keypoints, std)
+
+    scoring = scoring or Scoring(config.depth_range)
+    return _evaluate(predicted, capture, view_sets, scoring, meter, report)
 
 
 def evaluate_files(
@@ -64,33 +89,80 @@ def evaluate_files(
     capture: Capture,
     view_sets: Sequence[ViewSet],
     *,
-    depth_range: tuple[float, float],
+    depth_range: tuple[float, float] = (0.5, 10.0),
+    scoring: Scoring | None = None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> CaptureScores:
-    """Score the maps that `deltas depth` wrote.
+    """Score the maps that `deltas depth` wrote, or another program in its layout.
 
     Args:
-        predictions: its output folder.
+        predictions: its output folder, which holds depth/ID.png, npz, tiff or pfm.
         capture: frames with sensor depth.
         view_sets: whose anchors are scored.
-        depth_range: (near, far) of the true depth that counts, metres.
+        depth_range: (near, far) of the true depth that counts, metres, where ``scoring`` is not
+            given.
+        scoring: how.
+        report: called with the id of every finished frame.
 
     Raises:
-        UserError: a map is missing or cannot be read.
+        UserError: all frames fail, or no anchor has true depth in range.
     """
-    scores: dict[str, MapScores | None] = {}
     scale = recorded_depth_scale(predictions)
-    for views in view_sets:
-        predicted = read_depth_map(predictions, views.anchor, scale)
-        truth = depth_at_image(capture.frame(views.anchor))
-        scores[str(views.anchor)] = score_map(predicted, truth, depth_range, None)
-    return _mean(scores, capture.path, CalibrationMeter())
+
+    def read(views: ViewSet) -> _Scored:
+        return _Scored(read_depth_map(predictions, views.anchor, scale), None, None)
+
+    return _evaluate(read, capture, view_sets, scoring or Scoring(depth_range), None, report)
 
 
-def _mean(
-    scores: dict[str, MapScores | None], path: Path, meter: CalibrationMeter
+def _evaluate(
+    mapped: Callable[[ViewSet], _Scored],
+    capture: Capture,
+    view_sets: Sequence[ViewSet],
+    scoring: Scoring,
+    meter: CalibrationMeter | None,
+    report: Callable[[str], None],
 ) -> CaptureScores:
+    scores: dict[str, MapScores | None] = {}
+    failed: dict[str, UserError] = {}
+    own, seen = CalibrationMeter(), SeenMaps()
+    for views in view_sets:
+        try:
+            check_frames(capture, [views], with_depth=True)
+            frame = capture.frame(views.anchor)
+            truth, found = Truth.of(frame, scoring.truth_size), mapped(views)
+        except UserError as error:
+            failed[views.anchor] = error
+            report(views.anchor)
+            continue
+        scores[views.anchor] = _score(found, truth, scoring, own)
+        if scoring.consistency:
+            seen.add(frame, found.depth, truth.at_image)
+        report(views.anchor)
+    if failed and not scores:
+        raise next(iter(failed.values()))
     if all(score is None for score in scores.values()):
-        raise UserError(
-            "no anchor has true depth in range", path, "name a capture with sensor depth"
-        )
-    return mean_scores(scores, None if meter.empty else meter.result())
+        what, remedy = "no anchor has true depth in range", "name a capture with sensor depth"
+        raise UserError(what, capture.path, remedy)
+    if meter is not None:
+        meter.take(own)
+    return mean_scores(
+        scores,
+        None if own.empty else own.result(),
+        failed={id: str(error) for id, error in failed.items()},
+        consistency=seen.result() if scoring.consistency else None,
+    )
+
+
+def _score(
+    found: _Scored, truth: Truth, scoring: Scoring, meter: CalibrationMeter
+) -> MapScores | None:
+    sparse = None
+    if found.keypoints is not None:
+        sparse = score_keypoints(found.keypoints, truth.at_image, scoring.depth_range)
+    if found.relative_std is None:
+        true, depth = truth.beside(found.depth)
+        return score_map(depth, true, scoring.depth_range, sparse)
+    true, depth, std = truth.beside(found.depth, found.relative_std)
+    meter.add(depth, std, true, depth_range=scoring.depth_range)
+    return score_map(depth, true, scoring.depth_range, sparse, std)

@@ -78,14 +78,19 @@ class Record:
                     raise ValueError(f"{name} of a row must be a plain value, got {value!r}")
 
 
-def write_record(path: Path, record: Record) -> None:
+def write_record(path: Path, record: Record, *, beside: Mapping[str, Any] | None = None) -> None:
     """Write a record, atomically; values that JSON has not, as NaN, become null in rows.
+
+    Args:
+        path: the file.
+        record: the table.
+        beside: more that the file holds, under other names; :func:`read_record` passes over it.
 
     Raises:
         UserError: the system refuses.
     """
     content = asdict(record) | {"rows": [finite(row) for row in record.rows]}
-    write_json(path, {"writer": WRITER, "format": FORMAT, **content})
+    write_json(path, {"writer": WRITER, "format": FORMAT, **content, **(beside or {})})
 
 
 def read_record(path: Path) -> Record:

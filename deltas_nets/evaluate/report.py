@@ -1,12 +1,13 @@
-"""Metrics as a table for people and as JSON for programs."""
+"""Metrics as tables for people."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from deltas_nets.evaluate.calibration import Calibration
+from deltas_nets.evaluate.consistency import Consistency
+from deltas_nets.evaluate.dataset import DatasetScores
 from deltas_nets.evaluate.depth_metrics import DepthMetrics
 from deltas_nets.evaluate.scores import CaptureScores
 
@@ -19,6 +20,8 @@ NAMES = {
     "delta1": "delta < 1.25",
     "delta2": "delta < 1.25^2",
     "delta3": "delta < 1.25^3",
+    "delta105": "delta < 1.05",
+    "delta103": "delta < 1.03",
     "coverage": "coverage",
 }
 
@@ -26,11 +29,26 @@ NAMES = {
 def metrics_table(columns: Mapping[str, DepthMetrics], *, title: str) -> Table:
     """The paper's metrics, a column for each name: it fits any terminal."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     for name in columns:
-        table.add_column(name, justify="right")
+        table.add_column("\n".join(name.rsplit(" ", 1)), justify="right")
     for key, label in NAMES.items():
         table.add_row(label, *(f"{getattr(metrics, key):.3f}" for metrics in columns.values()))
+    return table
+
+
+def scenes_table(scores: DatasetScores, *, title: str) -> Table:
+    """A row a scene, and one of all: frames, those that failed, and the metrics most looked at."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.add_column("scene", overflow="fold")
+    for name in ("frames", "failed", "Abs Rel", "Abs, m", "RMSE, m", "delta < 1.25", "coverage"):
+        table.add_column(name, justify="right")
+    for name, scene in {**scores.scenes, "all": scores.total}.items():
+        shown = ("abs_rel", "abs_diff", "rmse", "delta1", "coverage")
+        numbers = (f"{getattr(scene.dense, key):.3f}" for key in shown)
+        table.add_row(name, str(len(scene.maps)), str(len(scene.failed)), *numbers)
+    for name in scores.failed:
+        table.add_row(name, "0", "all", *5 * ("",))
     return table
 
 
@@ -61,34 +79,21 @@ def sparsification_line(calibration: Calibration) -> str:
     )
 
 
+def consistency_line(found: Consistency) -> str:
+    """What maps of a scene say of each other."""
+    return (
+        f"pixels that agree to 5 % with a neighbouring map: {found.agreement:.3f}, of the true "
+        f"depth {found.truth:.3f} ({found.pairs} pairs); flicker of successive maps "
+        f"{found.flicker:.4f} ({found.successive} pairs)"
+    )
+
+
 def scores_by_name(scores: CaptureScores) -> dict[str, DepthMetrics]:
     """The columns of a capture's table."""
-    rows = {"dense": scores.dense, "median-scaled": scores.median_scaled}
-    return rows if scores.sparse is None else rows | {"sparse points": scores.sparse}
-
-
-def scores_as_json(scores: CaptureScores) -> dict[str, Any]:
-    """Everything in a capture's scores, JSON-ready."""
-    rows = {name: metrics._asdict() for name, metrics in scores_by_name(scores).items()}
-    written: dict[str, Any] = {"metrics": rows, "abs_rel_by_frame": scores.frames}
-    if scores.calibration is not None:
-        written["calibration"] = _calibration_as_json(scores.calibration)
-    return written
-
-
-def _calibration_as_json(calibration: Calibration) -> dict[str, Any]:
-    found = calibration.sparsification
-    return {
-        "pixels": calibration.pixels,
-        "abs_rel_of_all": found.every,
-        "abs_rel_of_certain_half": found.half,
-        "half_over_all": found.ratio,
-        "pooled_abs_rel_of_all": found.pooled_every,
-        "pooled_abs_rel_of_certain_half": found.pooled_half,
-        "pooled_half_over_all": found.pooled_ratio,
-        "deciles": [
-            decile._asdict()
-            | {"rms_ratio": decile.rms_ratio, "laplace_ratio": decile.laplace_ratio}
-            for decile in calibration.deciles
-        ],
+    rows = {
+        "dense": scores.dense,
+        "pooled": scores.pooled,
+        "median-scaled": scores.median_scaled,
+        "scale and shift": scores.fitted,
     }
+    return rows if scores.sparse is None else rows | {"sparse points": scores.sparse}

@@ -28,7 +28,7 @@ def test_a_hand_computed_map() -> None:
 def test_the_truth_has_no_error(truth: np.ndarray) -> None:
     metrics = depth_metrics(truth, truth)
     assert metrics is not None
-    assert metrics == (0, 0, 0, 0, 0, 1, 1, 1, 1)
+    assert metrics == (0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1)
 
 
 @given(truth=depths, scale=st.floats(0.5, 2.0))
