@@ -11,6 +11,26 @@ from deltas_geom.diagnosis.hypotheses import COMMON_SIZES, Hypothesis
 from deltas_geom.diagnosis.results import Diagnosis, Explanation, Mended
 from deltas_geom.diagnosis.trials import Trial, level
 
+_SENTENCES = {
+    Cause.TOO_FEW_MATCHES: "{cause}",
+    Cause.ALL_WELL: "{cause}: matches are {before} px off{but}",
+    Cause.NO_SINGLE_CAUSE: "{cause}: matches are {before} px off ({worst} px)",
+    Cause.NO_BASELINE: (
+        "{cause}: rotations explain the matches to {before} px, cameras turn in one place or all "
+        "is far away; translations cannot be told"
+    ),
+    Cause.CAMERA_DISAGREES: (
+        "camera {one} disagrees with all others: its matches are {before} px off, those of the "
+        "others {after} px"
+    ),
+    Cause.VIEWS_SWAPPED: (
+        "the pixels of views {one} and {other} are exchanged: matches are {before} px off as "
+        "given, {after} px with the cure"
+    ),
+}
+_MENDED = "{cause}{alone}{by}: matches are {before} px off as given, {after} px with the cure"
+_MOVING = "{cause}: all cameras stand in one place, yet matches move against it"
+
 
 class Told(NamedTuple):
     """What is known before there is a cause.
@@ -68,35 +88,21 @@ class Told(NamedTuple):
         return before, level(trial.residual[trial.concerned])
 
     def _sentence(self, what: Hypothesis, before: float, after: float, moves: bool) -> str:
-        cause = what.cause
-        figures = f"matches are {before:.3g} px off as given, {after:.3g} px with the cure"
-        if cause is Cause.TOO_FEW_MATCHES:
-            return f"{cause.value}"
-        if cause is Cause.ALL_WELL:
-            off = int((self.given.residual > 3 * before + 1).sum())
-            but = f", but in {off} of {len(self.given.residual)} pairs of views" if off else ""
-            return f"{cause.value}: matches are {before:.3g} px off{but}"
-        if cause is Cause.NO_SINGLE_CAUSE:
-            order = self.cameras.nan_to_num(-1.0).argsort(descending=True)[:3].tolist()
-            worst = ", ".join(f"camera {view} by {self.cameras[view]:.3g}" for view in order)
-            return f"{cause.value}: matches are {before:.3g} px off ({worst} px)"
-        if cause is Cause.NO_BASELINE and moves:
-            return f"{cause.value}: all cameras stand in one place, yet matches move against it"
-        if cause is Cause.NO_BASELINE:
-            return (
-                f"{cause.value}: rotations explain the matches to {before:.3g} px, cameras turn in "
-                "one place or all is far away; translations cannot be told"
-            )
-        if cause is Cause.CAMERA_DISAGREES:
-            return (
-                f"camera {what.cameras[0]} disagrees with all others: its matches are {before:.3g} "
-                f"px off, those of the others {after:.3g} px"
-            )
-        if cause is Cause.VIEWS_SWAPPED:
-            one, other = what.cameras
-            return f"the pixels of views {one} and {other} are exchanged: {figures}"
-        of = f" (camera {what.cameras[0]} alone)" if what.cameras else ""
-        return f"{cause.value}{of}{_by(what)}: {figures}"
+        off = int((self.given.residual > 3 * before + 1).sum())
+        worst = self.cameras.nan_to_num(-1.0).argsort(descending=True)[:3].tolist()
+        one, other = (*what.cameras, None, None)[:2]
+        template = _SENTENCES.get(what.cause, _MENDED)
+        return (_MOVING if moves else template).format(
+            cause=what.cause.value,
+            before=f"{before:.3g}",
+            after=f"{after:.3g}",
+            but=f", but in {off} of {len(self.given.residual)} pairs of views" if off else "",
+            worst=", ".join(f"camera {view} by {self.cameras[view]:.3g}" for view in worst),
+            one=one,
+            other=other,
+            alone=f" (camera {one} alone)" if what.cameras else "",
+            by=_by(what),
+        )
 
     def _mended(self, what: Hypothesis) -> Mended:
         views, pixels, seen = self.views, self.pixels, self.seen.to(self.pixels.device)
