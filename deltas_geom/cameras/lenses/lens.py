@@ -70,17 +70,13 @@ class Lens:
 
     def __post_init__(self) -> None:
         wanted = self.coefficient_names(self.model)
-        # What stands for tensors in a tree may be anything.
-        if isinstance(self.K, Tensor) and isinstance(self.coefficients, Tensor):
-            check_shapes(K=(self.K, "3 3"), coefficients=(self.coefficients, "C"))
-            count = self.coefficients.shape[-1]
-            if count != len(wanted):
-                listed = f" ({' '.join(wanted)})" if wanted else ""
-                raise ShapeError(
-                    f"coefficients of {self.model} must be {len(wanted)}{listed}, got {count}"
-                )
-        else:
-            check_shapes(K=(self.K, "3 3"), coefficients=(self.coefficients, "C"))
+        check_shapes(K=(self.K, "3 3"), coefficients=(self.coefficients, "C"))
+        count = self.coefficients.shape[-1]
+        if count != len(wanted):
+            listed = f" ({' '.join(wanted)})" if wanted else ""
+            raise ShapeError(
+                f"coefficients of {self.model} must be {len(wanted)}{listed}, got {count}"
+            )
 
     @staticmethod
     def models() -> list[str]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.lenses.models import MODELS
-from deltas_geom.checks import ShapeError, check_shapes
+from deltas_geom.checks import ShapeError, batch_shape, check_shapes
 from deltas_geom.numerics.arithmetic import promoted
 
 _OPENCV = {
@@ -62,11 +62,10 @@ def to_parameters(model: str, K: Tensor, coefficients: Tensor) -> Tensor:
     """COLMAP's parameters of a model."""
     K, coefficients = promoted(K, coefficients)
     if model == _PANORAMA:
-        sides = torch.stack([2 * math.pi * K[..., 0, 0], math.pi * K[..., 1, 1]], dim=-1)
-        return sides
+        return torch.stack([2 * math.pi * K[..., 0, 0], math.pi * K[..., 1, 1]], dim=-1)
     diagonal = K.diagonal(dim1=-2, dim2=-1)[..., : MODELS[model].focals]
     known = torch.cat([diagonal, K[..., :2, 2] + 0.5], dim=-1)
-    batch = torch.broadcast_shapes(known.shape[:-1], coefficients.shape[:-1])  # type: ignore[no-untyped-call]
+    batch = batch_shape(known.shape[:-1], coefficients.shape[:-1])
     parts = [part.expand(*batch, part.shape[-1]) for part in (known, coefficients)]
     return torch.cat(parts, dim=-1)
 

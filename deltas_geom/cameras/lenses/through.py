@@ -8,6 +8,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.lenses.many import MANY, by_chunks, rays_around_axis
 from deltas_geom.cameras.lenses.models import MODELS
+from deltas_geom.cameras.projection import entries_of
 from deltas_geom.cameras.views import finite_intrinsics
 from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.numerics.arithmetic import (
@@ -117,8 +118,7 @@ def _reach(model: str, coefficients: Tensor) -> Tensor:
 def _pixels(
     model: str, derivable: bool, K: Tensor, coefficients: Tensor, reach: Tensor, points: Tensor
 ) -> _Both:
-    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
-    (fx, skew, cx), (_, fy, cy) = of_x.unbind(dim=-2), of_y.unbind(dim=-2)
+    fx, skew, cx, fy, cy = entries_of(K)
     xyz, finite = finite_or_zero(points.to(K.dtype), limit=_FAR)
     u, v, seen = MODELS[model].pixels(_terms(coefficients), reach, *xyz.unbind(dim=-1))
     x = torch.addcmul(torch.addcmul(cx, fx, u), skew, v)
@@ -139,8 +139,7 @@ def _rays(
 ) -> _Both:
     # Beyond that many px a float64 knows no pixel, nor its square.
     xy, finite = finite_or_zero(pixels.to(K.dtype), limit=_LARGEST)
-    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
-    (fx, skew, cx), (_, fy, cy) = of_x.unbind(dim=-2), of_y.unbind(dim=-2)
+    fx, skew, cx, fy, cy = entries_of(K)
     x, y = xy.unbind(dim=-1)
     v = (y - cy) / fy
     u = torch.addcmul(x - cx, skew, v, value=-1) / fx
