@@ -103,6 +103,25 @@ def check_index(**named: Tensor) -> None:
             raise TypeError(f"{name} must hold integers, got {index.dtype}")
 
 
+def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:
+    """The batch dims to which all tensors broadcast, None being left out; raise as check_shapes.
+
+    Raises:
+        ShapeError: as :func:`check_shapes`, or batch dims do not broadcast.
+        TypeError: as :func:`check_shapes`.
+
+    Example:
+        >>> import torch
+        >>> cameras, pixels = torch.zeros(5, 1, 2, 3, 4), torch.zeros(3, 2, 7, 2)
+        >>> check_batch(proj=(cameras, "V 3 4"), pixels=(pixels, "V N 2"), mask=(None, "V N"))
+        torch.Size([5, 3])
+    """
+    given = {name: (tensor, spec) for name, (tensor, spec) in named.items() if tensor is not None}
+    check_shapes(**given)
+    # Of "+V 3 4" there are as many dims as words.
+    return batch_shape(*(x.shape[: x.ndim - len(spec.split())] for x, spec in given.values()))
+
+
 def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:
     """The shape to which leading batch dims broadcast; raise ``ShapeError`` where they do not."""
     if torch.compiler.is_compiling():

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.checks import batch_shape, check_bool, check_image_size, check_shapes
+from deltas_geom.checks import check_batch, check_bool, check_image_size
 from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 from deltas_geom.records import Record
 
@@ -65,13 +65,9 @@ def rasterize_depth(
         tensor([[[2., 0.]]])
     """
     check_image_size(image_size)
-    check_shapes(pixels=(pixels, "N 2"), depth=(depth, "N"))
-    shapes = [pixels.shape[:-2], depth.shape[:-1]]
-    for name, tensor in (("mask", mask), ("weights", weights)):
-        if tensor is not None:
-            check_shapes(pixels=(pixels, "N 2"), **{name: (tensor, "N")})
-            shapes.append(tensor.shape[:-1])
-    batch = batch_shape(*shapes)
+    batch = check_batch(
+        pixels=(pixels, "N 2"), depth=(depth, "N"), mask=(mask, "N"), weights=(weights, "N")
+    )
     check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
     pixels, depth, given = promoted(pixels, depth, given)

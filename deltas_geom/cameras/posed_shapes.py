@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import ShapeError, batch_shape, check_shapes
+from deltas_geom.checks import ShapeError, check_batch
 
 
 def posed_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:
@@ -11,8 +11,7 @@ def posed_shapes(K: Tensor, poses: Tensor, name: str) -> torch.Size:
     tensors = isinstance(K, Tensor) and isinstance(poses, Tensor)
     if tensors and K.shape[-3:-2] != poses.shape[-3:-2]:
         _refuse_one_for_all(K, poses, name)
-    check_shapes(**{"K": (K, "V 3 3"), name: (poses, "V 4 4")})
-    return batch_shape(K.shape[:-3], poses.shape[:-3])
+    return check_batch(**{"K": (K, "V 3 3"), name: (poses, "V 4 4")})
 
 
 def _refuse_one_for_all(K: Tensor, poses: Tensor, name: str) -> None:

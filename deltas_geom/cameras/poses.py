@@ -7,7 +7,7 @@ no gradient.
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import check_batch, check_shapes
 from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 
 
@@ -37,8 +37,7 @@ def inverse_of_finite(b_from_a: Tensor) -> Tensor:
 @without_autocast
 def relative_pose(b_from_world: Tensor, a_from_world: Tensor) -> Tensor:
     """``b_from_a`` ``(*B, 4, 4)`` of two cameras posed in one world; ``*B`` broadcasts."""
-    check_shapes(b_from_world=(b_from_world, "4 4"), a_from_world=(a_from_world, "4 4"))
-    batch_shape(b_from_world.shape[:-2], a_from_world.shape[:-2])
+    check_batch(b_from_world=(b_from_world, "4 4"), a_from_world=(a_from_world, "4 4"))
     b_from_world, a_from_world = promoted(b_from_world, a_from_world)
     (b, b_finite), (a, a_finite) = finite_or_zero(b_from_world, 2), finite_or_zero(a_from_world, 2)
     return only(b @ inverse_of_finite(a), a_finite, b_finite, other=torch.nan)

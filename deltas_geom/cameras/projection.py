@@ -5,7 +5,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, with_one
 from deltas_geom.cameras.views import PosedViews, finite_intrinsics, finite_views
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_shapes
 from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 from deltas_geom.records import Record
 
@@ -103,18 +103,22 @@ def pixel_rays(K: Tensor, pixels: Tensor) -> Tensor:
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
-    check_shapes(K=(K, "3 3"), pixels=(pixels, "N 2"))
-    batch_shape(K.shape[:-2], pixels.shape[:-2])
+    check_batch(K=(K, "3 3"), pixels=(pixels, "N 2"))
     K, pixels = promoted(K, pixels)
     (K, known), (pixels, seen) = finite_intrinsics(K), finite_or_zero(pixels)
     return only(rays_of_finite(K, pixels), seen, known)
 
 
+def entries_of(K: Tensor) -> tuple[Tensor, ...]:
+    """fx, skew, cx, fy and cy, each ``(*B, 1)``, of intrinsics ``(*B, 3, 3)``."""
+    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
+    return (*of_x.unbind(dim=-2), *of_y.unbind(dim=-2)[1:])
+
+
 def rays_of_finite(K: Tensor, pixels: Tensor) -> Tensor:
     """:func:`pixel_rays` of what is finite, with focal lengths that are not 0."""
     # Back substitution: exact for a camera and cheaper than a general inverse.
-    of_x, of_y, _ = K.unsqueeze(-1).unbind(dim=-3)
-    (fx, skew, cx), (_, fy, cy) = of_x.unbind(dim=-2), of_y.unbind(dim=-2)
+    fx, skew, cx, fy, cy = entries_of(K)
     x, y = pixels.unbind(dim=-1)
     y = (y - cy) / fy
     x = (x - cx - skew * y) / fx

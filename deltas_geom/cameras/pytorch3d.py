@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.checks import check_batch, check_image_size
 from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
@@ -17,14 +17,13 @@ def from_pytorch3d(
 ) -> tuple[Tensor, Tensor]:
     """K ``(*B, V, 3, 3)`` and ``cam_from_world`` of :meth:`PosedViews.from_pytorch3d`."""
     check_image_size(image_size)
-    check_shapes(
+    batch = check_batch(
         R=(R, "V 3 3"),
         T=(T, "V 3"),
         focal_length=(focal_length, "V 2"),
         principal_point=(principal_point, "V 2"),
     )
     given = promoted(R, T, focal_length, principal_point)
-    batch = batch_shape(R.shape[:-3], *(each.shape[:-2] for each in given[1:]))
     R, T, focal, principal = (
         each.expand(*batch, *each.shape[dims:])
         for each, dims in zip(given, (-3, -2, -2, -2), strict=True)

@@ -6,7 +6,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import with_one
 from deltas_geom.cameras.poses import inverse_of_finite
 from deltas_geom.cameras.views import PosedViews, finite_views
-from deltas_geom.checks import batch_shape, check_shapes
+from deltas_geom.checks import check_batch
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
@@ -91,8 +91,7 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
 
     Source: Hartley and Zisserman, 2nd ed., section 9.2.
     """
-    check_shapes(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
-    batch_shape(fundamental.shape[:-2], pixels.shape[:-2])
+    check_batch(fundamental=(fundamental, "3 3"), pixels=(pixels, "N 2"))
     fundamental, pixels = promoted(fundamental, pixels)
     (fundamental, known), (pixels, seen) = finite_or_zero(fundamental, 2), finite_or_zero(pixels)
     homogeneous = with_one(pixels)
@@ -124,8 +123,7 @@ def epipolar_distance(fundamental: Tensor, first: Tensor, second: Tensor) -> Ten
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
     """
-    check_shapes(fundamental=(fundamental, "3 3"), first=(first, "N 2"), second=(second, "N 2"))
-    batch_shape(fundamental.shape[:-2], first.shape[:-2], second.shape[:-2])
+    check_batch(fundamental=(fundamental, "3 3"), first=(first, "N 2"), second=(second, "N 2"))
     second, seen = finite_or_zero(second)
     terms = epipolar_lines(fundamental, first) * with_one(second)
     return only(terms, seen).sum(dim=-1)

@@ -10,7 +10,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.pixels import in_image, normalize_pixels
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_image_size, check_shapes
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
@@ -176,8 +176,7 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
         >>> sample_map(ramp, torch.tensor([[1.5, 0.0]]), image_size=(1, 4))
         tensor([[1.5000]])
     """
-    check_shapes(feature_map=(feature_map, "D +h +w"), pixels=(pixels, "N 2"))
-    batch = batch_shape(feature_map.shape[:-3], pixels.shape[:-2])
+    batch = check_batch(feature_map=(feature_map, "D +h +w"), pixels=(pixels, "N 2"))
     # The count, not -1: a reshape of no keypoints cannot infer it.
     count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]
     maps, pixels = promoted(feature_map, pixels)

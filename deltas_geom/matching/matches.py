@@ -10,7 +10,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_bool, check_shapes
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
 from deltas_geom.numerics.arithmetic import (
     both,
@@ -91,13 +91,12 @@ def soft_argmax(
         >>> soft_argmax(logits, torch.tensor([[1.0], [2.0], [3.0]])).position
         tensor([2.])
     """
-    check_shapes(logits=(logits, "+S"), positions=(positions, "S D"))
+    batch = check_batch(logits=(logits, "+S"), positions=(positions, "S D"), mask=(mask, "S"))
     check_bool(mask=mask)
     if window is not None and window < 0:
         raise ValueError(f"window must not be negative, got {window}")
-    batches = [logits.shape[:-1], positions.shape[:-2], () if mask is None else mask.shape[:-1]]
     positions, known = finite_or_zero(positions)
-    logits, finite = finite_or_zero(logits.expand(*batch_shape(*batches), -1), dims=0)
+    logits, finite = finite_or_zero(logits.expand(*batch, -1), dims=0)
     possible = both(both(mask, finite), None if known is None else known[..., 0])
     lowest = torch.finfo(logits.dtype).min / 4
     probability = only(only(logits, possible, other=lowest).softmax(dim=-1), possible)

@@ -1,9 +1,5 @@
 """Symmetric 4x4 matrices and their LDL^T, by arithmetic alone.
 
-A batch of matrices is a struct of arrays: ten tensors of any common shape, the upper triangle
-row by row. Elementwise arithmetic over the batch is an order of magnitude faster than a
-batched library call, never raises and compiles.
-
 Source: Golub and Van Loan, 4th ed., sections 4.1 and 5.2.8.
 """
 
@@ -12,10 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-Symmetric4 = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""m00 m01 m02 m03 m11 m12 m13 m22 m23 m33."""
-Vector3 = tuple[Tensor, Tensor, Tensor]
-Vector4 = tuple[Tensor, Tensor, Tensor, Tensor]
+from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, less, scaled
 
 
 def rounding(matrix: Symmetric4) -> Tensor:
@@ -39,34 +32,6 @@ def multiply(matrix: Symmetric4, x: Vector4) -> Vector4:
     )
 
 
-def dot(a: Vector4, b: Vector4) -> Tensor:
-    """a · b."""
-    total = a[0] * b[0]
-    for i in range(1, 4):
-        total = torch.addcmul(total, a[i], b[i])
-    return total
-
-
-def dot3(a: Vector3, b: Vector3) -> Tensor:
-    """a · b of three components."""
-    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
-
-
-def unit(x: Vector4) -> Vector4:
-    """x / |x|."""
-    return scaled(x, dot(x, x).rsqrt())
-
-
-def scaled(x: Vector4, scale: Tensor) -> Vector4:
-    """Vectors, each times its number."""
-    return x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale
-
-
-def less(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """a - b c in one pass over memory, which is what this file costs."""
-    return torch.addcmul(a, b, c, value=-1)
-
-
 def shifted(matrix: Symmetric4, shift: Tensor) -> Symmetric4:
     """M - shift."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
@@ -77,16 +42,9 @@ class Pivots(NamedTuple):
     """LDL^T, unit lower triangular L.
 
     Attributes:
-        i0: inverse pivot 0, and so on.
-        i1: ...
-        i2: ...
+        i0, i1, i2: inverse pivots.
         d3: the last pivot, which may vanish.
-        l10: row 1, column 0 of L, and so on.
-        l20: ...
-        l30: ...
-        l21: ...
-        l31: ...
-        l32: ...
+        l10, l20, l30, l21, l31, l32: row 1, column 0 of L, and so on.
     """
 
     i0: Tensor
@@ -130,12 +88,8 @@ def eliminate(matrix: Symmetric4) -> Pivots:
 
 def factor(matrix: Symmetric4) -> Factors:
     """The same, to solve with."""
-    return _to_solve_with(eliminate(matrix))
-
-
-def _to_solve_with(pivots: Pivots) -> Factors:
-    d3 = pivots.d3
-    return Factors(pivots, (pivots.i0 * d3, pivots.i1 * d3, pivots.i2 * d3))
+    pivots = eliminate(matrix)
+    return Factors(pivots, scaled(pivots[:3], pivots.d3))
 
 
 def solve_leading(f: Pivots, b: Vector3) -> Vector3:

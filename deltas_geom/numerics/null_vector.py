@@ -19,20 +19,25 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 from deltas_geom.numerics.ldl import (
     Factors,
-    Symmetric4,
-    Vector4,
-    dot,
     factor,
-    less,
     multiply,
     rounding,
-    scaled,
     shifted,
     solve_scaled,
     start,
-    unit,
 )
 from deltas_geom.numerics.proof import proved_vector
+from deltas_geom.numerics.vectors import (
+    Symmetric4,
+    Vector4,
+    dot,
+    either,
+    less,
+    minus,
+    plus,
+    scaled,
+    unit,
+)
 
 # After the start. One is enough for good matches; gross outliers bring eigenvalues near.
 _INVERSE_ITERATIONS = 2
@@ -74,30 +79,12 @@ def null_vector(
     if surely_all(proved):
         return NullVector(vector, proved)
     hard = proved.logical_not().flatten().nonzero().squeeze(-1)
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
-        entry.flatten().index_select(0, hard) for entry in matrix
-    )
-    some = _iterated((m00, m01, m02, m03, m11, m12, m13, m22, m23, m33))
+    some = _iterated(tuple(entry.flatten().index_select(0, hard) for entry in matrix))
 
     def merged(easy: Tensor, other: Tensor) -> Tensor:
         return easy.flatten().index_copy(0, hard, other).view_as(easy)
 
-    x0, x1, x2, x3 = map(merged, vector, some.vector)
-    return NullVector((x0, x1, x2, x3), merged(proved, some.simple))
-
-
-def _inverse_iterations(matrix: Symmetric4, noise: Tensor) -> tuple[Factors, Vector4, Vector4]:
-    """Factors of M + noise, and two vectors, the second of which is d3 times its solution.
-
-    The first is of unit length.
-    """
-    # Above the null space by the rounding of M, every pivot is positive.
-    factors = factor(shifted(matrix, -noise))
-    x = start(factors)
-    for _ in range(_INVERSE_ITERATIONS - 1):
-        x = solve_scaled(factors, x)
-    x = unit(x)  # before it overflows: towards infinity each solve makes it longer
-    return factors, x, solve_scaled(factors, x)
+    return NullVector(tuple(map(merged, vector, some.vector)), merged(proved, some.simple))
 
 
 def _iterated(
@@ -107,7 +94,13 @@ def _iterated(
     polish: int = 0,
 ) -> NullVector:
     noise = rounding(matrix)
-    factors, x, near = _inverse_iterations(matrix, noise)
+    # Above the null space by the rounding of M, every pivot is positive.
+    factors = factor(shifted(matrix, -noise))
+    x = start(factors)
+    for _ in range(_INVERSE_ITERATIONS - 1):
+        x = solve_scaled(factors, x)
+    x = unit(x)  # before it overflows: towards infinity each solve makes it longer
+    near = solve_scaled(factors, x)
     length = dot(near, near)
     quotient = factors.pivots.d3 * dot(near, x) / length - noise
     near, quotient = _nearer(matrix, scaled(near, length.rsqrt()), quotient, noise)
@@ -129,7 +122,8 @@ def _nearer(
     """A Rayleigh quotient iteration, and the smallest of what it and its start span.
 
     Between two close eigenvalues the iteration alone may stay where it is, or leave for the
-    larger one; in the plane of both (Rayleigh-Ritz) the smaller one is found.
+    larger one; in the plane of both (Rayleigh-Ritz) the smaller one is found. Vectors the squared
+    sine of whose angle is lost in rounding count as one.
 
     Args:
         matrix: M.
@@ -144,19 +138,9 @@ def _nearer(
     below = -0.4 * noise
     factors = factor(shifted(matrix, quotient - below))
     same = 256 * torch.finfo(noise.dtype).eps
-    return _smaller(factors, a, quotient, below=below, noise=noise, same=same)
-
-
-def _smaller(
-    factors: Factors, a: Vector4, quotient: Tensor, *, below: Tensor, noise: Tensor, same: float
-) -> tuple[Vector4, Tensor]:
-    """The same by factors of M - (quotient - below).
-
-    Vectors the squared sine of whose angle is below ``same`` count as one.
-    """
     b = solve_scaled(factors, a)  # K b = d3 a with K = M - shift, and a^T K a = below
     along, length = dot(a, b), dot(b, b)
-    across = torch.addcmul(length, along, along, value=-1)
+    across = less(length, along, along)
     # K in the plane, times across: below * across, g * sqrt(across), -along * g.
     g = less(factors.pivots.d3, below, along)
     half = 0.5 * torch.addcmul(below * across, along, g)
@@ -166,22 +150,18 @@ def _smaller(
     zero, one = noise.new_zeros(()), noise.new_ones(())
     of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
     of_b = torch.where(flat, one, -step)
-    x0, x1, x2, x3 = (torch.addcmul(of_a * p, of_b, q) for p, q in zip(a, b, strict=True))
+    nearer = plus(scaled(a, of_a), of_b, b)
     change = torch.where(flat, below - factors.pivots.d3 * along / length, step / across)
-    return (x0, x1, x2, x3), quotient - change
+    return nearer, quotient - change
 
 
 def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
     """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
     image = product(x)
     mu = dot(x, image)
-    g0, g1, g2, g3 = (less(image[i], mu, x[i]) for i in range(4))
-    inverse = factors.pivots.d3.reciprocal()
-    change = solve_scaled(factors, (g0, g1, g2, g3))
+    change = solve_scaled(factors, minus(image, mu, x))
     # What the solve amplifies is along x, and goes.
-    along = dot(x, change)
-    x0, x1, x2, x3 = (less(x[i], inverse, less(change[i], along, x[i])) for i in range(4))
-    return x0, x1, x2, x3
+    return minus(x, factors.pivots.d3.reciprocal(), minus(change, dot(x, change), x))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
@@ -197,9 +177,9 @@ def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
     image = multiply(matrix, x)
     # M x is mu x but for rounding, which the derivative of the inverse would multiply: by 1e9 where
     # all but one of the weights are 1e-6.
-    i0, i1, i2, i3 = (component - component.detach() for component in image)
-    change = solve_in_complement(matrix, x, dot(x, image), (i0, i1, i2, i3))
-    return x[0] - change[0], x[1] - change[1], x[2] - change[2], x[3] - change[3]
+    moved = tuple(component - component.detach() for component in image)
+    change = solve_in_complement(matrix, x, dot(x, image), moved)
+    return tuple(before - by for before, by in zip(x, change, strict=True))
 
 
 def solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) -> Vector4:
@@ -223,7 +203,7 @@ def solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) 
     a12 = less(less(m12, x1, q2), q1, x2)
     a22 = less(m22 - mu, 2 * x2, q2)
     reflect = beta * dot(u, g)
-    h0, h1, h2 = less(g[0], reflect, x0), less(g[1], reflect, x1), less(g[2], reflect, x2)
+    h0, h1, h2 = minus(g[:3], reflect, x[:3])
 
     noise = rounding(matrix)
     i0, definite0 = _reciprocal(a00, noise)
@@ -239,12 +219,8 @@ def solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) 
     h0 = less(less(h0 * i0, l10, h1), l20, h2)
 
     reflect = beta * (x0 * h0 + x1 * h1 + x2 * h2)
-    solution = (
-        less(h0, reflect, u[0]), less(h1, reflect, u[1]), less(h2, reflect, u[2]),
-        -reflect * u[3],
-    )  # fmt: skip
-    s0, s1, s2, s3 = (torch.where(definite, component, 0.0) for component in solution)
-    return s0, s1, s2, s3
+    solution = (*minus((h0, h1, h2), reflect, u[:3]), -reflect * u[3])
+    return either(definite, solution, (0.0,) * 4)
 
 
 def _reciprocal(pivot: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

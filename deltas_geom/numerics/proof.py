@@ -9,16 +9,8 @@ Source: Golub and Van Loan, 4th ed., sections 8.1.3 (bounds) and 8.2 (inverse it
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.ldl import (
-    Symmetric4,
-    Vector3,
-    Vector4,
-    dot3,
-    eliminate,
-    less,
-    rounding_of,
-    solve_leading,
-)
+from deltas_geom.numerics.ldl import eliminate, rounding_of, solve_leading
+from deltas_geom.numerics.vectors import Symmetric4, Vector4, dot, less, plus
 
 
 def proved_vector(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]:
@@ -37,10 +29,10 @@ def proved_vector(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]
     p0 = less(less(f.l30, f.l10, p1), f.l20, p2)
     p = p0, p1, p2
     q = solve_leading(f, p)
-    size = 1 + dot3(p, p)
+    size = 1 + dot(p, p)
     t = f.d3 / size
-    y = _plus(p, t, q)
-    x0, x1, x2 = _plus(p, f.d3 / (1 + dot3(p, y)), solve_leading(f, y))
+    y = plus(p, t, q)
+    x = plus(p, f.d3 / (1 + dot(p, y)), solve_leading(f, y))
 
     trace = matrix[0] + matrix[4] + matrix[7] + matrix[9]
     inverse = (0.5 * trace).square() * f.i0 * f.i1 * f.i2  # 1 / s
@@ -49,16 +41,8 @@ def proved_vector(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]
     apart = (share > 0) & (share <= 0.1)
     ratio = share / size
     # |y| >= |x|, since p^T A^-1 p is positive; the residual is t^2 times q across x.
-    along = dot3(p, q)
-    across = less(dot3(q, q) * size, along, along)  # squared, times |x|^2
+    along = dot(p, q)
+    across = less(dot(q, q) * size, along, along)  # squared, times |x|^2
     bound = (ratio * ratio * t).square() * across
     proved = apart & (bound <= (0.9 * accuracy) ** 2 * size.square())
-    return (x0, x1, x2, torch.full_like(t, -1.0)), proved
-
-
-def _plus(a: Vector3, scale: Tensor, b: Vector3) -> Vector3:
-    return (
-        torch.addcmul(a[0], scale, b[0]),
-        torch.addcmul(a[1], scale, b[1]),
-        torch.addcmul(a[2], scale, b[2]),
-    )
+    return (*x, torch.full_like(t, -1.0)), proved

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.ldl import Vector4, dot, dot3, multiply, unit
+from deltas_geom.numerics.ldl import multiply
 from deltas_geom.numerics.null_vector import solve_in_complement
 from deltas_geom.numerics.sums import over_points, product
+from deltas_geom.numerics.vectors import Vector3, Vector4, dot, either, minus, scaled
 from deltas_geom.triangulation.equations import Equations, Rig, out_of_frame
-from deltas_geom.triangulation.observed import Observations, Vector3, homogeneous_in_views, inverted
-from deltas_geom.triangulation.rig_frame import squared_length
-from deltas_geom.triangulation.solution import of_trace_one
+from deltas_geom.triangulation.observed import Observations, homogeneous_in_views, inverted
+from deltas_geom.triangulation.solution import of_length_one, of_trace_one
 from deltas_geom.triangulation.weights import Weights
 
 
@@ -129,31 +129,20 @@ def _over_points(
 def _pulled(equations: Equations, vector: Vector4, valid: Tensor, gradient: Vector3) -> _Pull:
     frame = equations.frame
     matrix, share = of_trace_one(equations.normal, valid)
-    g0, g1, g2 = (torch.where(valid, component, 0.0) for component in gradient)
-    x0, x1, x2, x3 = (
-        torch.where(valid, component, constant)
-        for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
-    )
-    x = unit((x0, x1, x2, x3))
+    g, x = either(valid, gradient, (0.0,) * 3), of_length_one(vector, valid)
     mu = dot(x, multiply(matrix, x))
     scale = frame.unit * share / x[3]
-    along = dot3((g0, g1, g2), (x[0], x[1], x[2])) / x[3]
-    of_x = (g0 * scale, g1 * scale, g2 * scale, -along * scale)
-    y = solve_in_complement(matrix, x, mu, of_x)
+    along = dot(g, x[:3]) / x[3]
+    y = solve_in_complement(matrix, x, mu, (*scaled(g, scale), -along * scale))
     # By the frame's origin and unit, which matter where the errors do not vanish: M x = mu x and
     # M y = mu y + of_x leave little of what T^T M T says. In the world's frame they are fixed.
     by_unit = 2 * mu / (share * frame.unit) * (0.0 if equations.fixed else 1.0)
-    half = 0.5 * by_unit
-    by_origin = [-half * (y[3] * x[k] + x[3] * y[k]) for k in range(3)]
-    total = frame.total
+    half, total = 0.5 * by_unit, frame.total
+    alpha = tuple(-half * (y[3] * x[k] + x[3] * y[k]) / total for k in range(3))
     beta = by_unit * x[3] * y[3] / (2 * frame.unit * total)
-    ox, oy, oz = frame.origin
-    alpha = [component / total for component in by_origin]
-    constant = beta * (squared_length((ox, oy, oz)) - frame.unit.square())
-    constant = constant - dot3((alpha[0], alpha[1], alpha[2]), (ox, oy, oz))
-    twice = 2 * beta
-    linear = [a - twice * o for a, o in zip(alpha, (ox, oy, oz), strict=True)]
-    framed = (constant, beta, *linear)
+    constant = beta * (dot(frame.origin, frame.origin) - frame.unit.square())
+    constant = constant - dot(alpha, frame.origin)
+    framed = (constant, beta, *minus(alpha, 2 * beta, frame.origin))
     return _Pull(out_of_frame(frame, x), out_of_frame(frame, y), framed)
 
 
@@ -163,8 +152,8 @@ def _of_cameras(rig: Rig, near: Tensor, centers: Tensor) -> Tensor:
     rows, last = near[..., :3], near[..., 3:]
     offset = cameras.centers - datum
     center = centers[..., 1:] + 2 * offset * centers[..., :1]
-    cofactors, inverse = inverted(cameras.proj[..., :3])
-    position = -inverse[..., None] * (cofactors * center.unsqueeze(-2)).sum(dim=-1)
+    inverse, _ = inverted(cameras.proj[..., :3])
+    position = -(inverse * center.unsqueeze(-1)).sum(dim=-2)
     position = position.unsqueeze(-1)  # by the last column, and through it by the others
     rows = rows + last * datum.unsqueeze(-2) + position * cameras.centers.unsqueeze(-2)
     found = torch.cat([rows, last + position], dim=-1)

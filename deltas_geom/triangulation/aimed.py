@@ -19,17 +19,17 @@ from deltas_geom.numerics.arithmetic import (
     promoted,
     without_autocast,
 )
+from deltas_geom.numerics.vectors import dot
 from deltas_geom.triangulation.bearings import (
     Bearings,
     angles_of,
     check_bearings,
-    dot,
     see_rays,
 )
 from deltas_geom.triangulation.rays import triangulate_rays
 from deltas_geom.triangulation.refine import Refined, refine_points
 from deltas_geom.triangulation.reprojection import mean_of
-from deltas_geom.triangulation.results import RobustTriangulation
+from deltas_geom.triangulation.results import RobustTriangulation, of_inliers
 from deltas_geom.triangulation.robust import triangulate_robust
 from deltas_geom.triangulation.robust_loss import Loss
 from deltas_geom.triangulation.solution import kept
@@ -100,12 +100,9 @@ def triangulate_robust_rays(
                 max_pairs=max_pairs,
             )
             parts.append((found.inliers.squeeze(-1).mT, found.status.squeeze(-1)))
-        inliers = torch.cat([part for part, _ in parts], dim=-1)
-        reason = torch.cat([part for _, part in parts], dim=-1)
+        inliers, reason = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
     points = triangulate_rays(cam_from_world, rays, weights, inliers, covariance=covariance)
-    status = torch.where(inliers.any(dim=-2), points.status, reason)
-    inliers = inliers & points.valid.unsqueeze(-2)
-    return RobustTriangulation(**points._replace(status=status)._asdict(), inliers=inliers)
+    return of_inliers(points, inliers, reason)
 
 
 @without_autocast
@@ -200,8 +197,9 @@ def ray_covariance(
 
     Source: as of :func:`point_covariance`.
     """
-    check_shapes(points=(points, "N 3"), weights=(weights, "V N"))
-    check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), weights=(weights, "V N"))
+    check_shapes(
+        cam_from_world=(cam_from_world, "+V 4 4"), weights=(weights, "V N"), points=(points, "N 3")
+    )
     poses, place = promoted(cam_from_world[..., :3, :], points)
     # What is not finite has a ray of length 0, so that it is told, and passes no gradient.
     (near, _), (rows, _) = finite_or_zero(place), finite_or_zero(poses, dims=2)

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
-from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.numerics.vectors import Vector3, dot, minus, scaled
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
-from deltas_geom.triangulation.rig_frame import datum_of, squared_length
+from deltas_geom.triangulation.rig_frame import datum_of
 from deltas_geom.triangulation.solution import in_world, kept
 from deltas_geom.triangulation.uncertainty import inverse_information, unscaled
-from deltas_geom.triangulation.weights import Weights, check_weights, weigh
+from deltas_geom.triangulation.weights import Weights, weigh
 
 
 class Bearings(NamedTuple):
@@ -44,16 +44,14 @@ class Bearings(NamedTuple):
     def offsets(self, points: Vector3) -> Vector3:
         """From the centres to points three ``(*B, N)`` beside the datum: three ``(*B, V, N)``."""
         centers = (self.centers - self.datum)[..., None].unbind(dim=-2)
-        x, y, z = (p.unsqueeze(-2) - c for p, c in zip(points, centers, strict=True))
-        return x, y, z
+        return tuple(p.unsqueeze(-2) - c for p, c in zip(points, centers, strict=True))
 
     def in_front(self, points: Vector3) -> Tensor:
         """Is each point ahead on all its used rays, by more than rounding? ``(*B, N)``."""
         with torch.no_grad():
             along = dot(self.directions, self.offsets(points))
-            x, y, z = in_world(points, self.datum)
             # At a camera's centre, within rounding, a point has no angle.
-            size = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()).unsqueeze(-2)
+            size = _largest(in_world(points, self.datum)).unsqueeze(-2)
             size = size + self.centers.abs().amax(dim=-1)[..., None]
             ahead = along > 64 * torch.finfo(along.dtype).eps * size
             return (ahead | self.weights.unused).all(dim=-2)
@@ -63,8 +61,14 @@ def check_bearings(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> torch.Size:
     """The batch dims to which all broadcast; raise unless rays ``(*B, V, N, 3)`` fit cameras."""
-    check_shapes(cam_from_world=(cam_from_world, "+V 4 4"), rays=(rays, "V N 3"))
-    return check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
+    batch = check_batch(
+        cam_from_world=(cam_from_world, "+V 4 4"),
+        rays=(rays, "V N 3"),
+        weights=(weights, "V N"),
+        mask=(mask, "V N"),
+    )
+    check_bool(mask=mask)
+    return batch
 
 
 def see_rays(
@@ -72,30 +76,29 @@ def see_rays(
 ) -> Bearings:
     """Tell used rays ``(*B, V, N, 3)`` of cameras ``(*B, V, 4, 4)`` from others."""
     work = solver_dtype(rays)
-    batch = check_weights(weights, mask, "rays", rays, "V N 3", cam_from_world.shape[:-3])
+    batch = check_bearings(cam_from_world, rays, weights, mask)
     pose = cam_from_world[..., :3, :].to(work)  # whatever the last row
     x, y, z = (one.to(work, memory_format=torch.contiguous_format) for one in rays.unbind(dim=-1))
     with torch.no_grad():
         # Squares of what is let through can be represented. NaN is not let through.
         posed = (pose.abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)
-        length = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+        length = _largest((x, y, z))
         sound = (length > 0) & (length <= torch.finfo(work).max)
     # Double where throughout: what is not used must pass no gradient and no NaN.
     pose = torch.where(posed[..., None, None], pose, 0.0)
     # Divided by its largest coordinate it cannot overflow when squared.
-    x, y, z = (safe_divide(one, length, sound) for one in (x, y, z))
-    a, b, c = pose[..., :3].unsqueeze(-2).unbind(dim=-3)  # each (*B, V, 1, 3)
-    x, y, z = (dot((x, y, z), (a[..., i], b[..., i], c[..., i])) for i in range(3))
-    square = squared_length((x, y, z))
+    ray = tuple(safe_divide(one, length, sound) for one in (x, y, z))
+    rows = pose[..., :3].unsqueeze(-2).unbind(dim=-3)  # each (*B, V, 1, 3)
+    ray = tuple(dot(ray, tuple(row[..., i] for row in rows)) for i in range(3))
+    square = dot(ray, ray)
     # A pose that is no rotation may turn a ray into nothing.
     sound = sound & posed.unsqueeze(-1) & (square.detach() > torch.finfo(work).tiny ** 0.4)
     every = surely_all(sound)
     inverse = square.rsqrt() if every else torch.where(sound, square, 1.0).rsqrt()
     centers = -(pose[..., :3] * pose[..., 3:]).sum(dim=-2)
     weighed = weigh(weights, mask, batch=batch, like=rays, sound=None if every else sound)
-    directions = (x * inverse, y * inverse, z * inverse)
     broken, datum = (~posed).to(work), datum_of(centers)
-    return Bearings(centers, datum, broken, directions, sound, weighed, rays.dtype)
+    return Bearings(centers, datum, broken, scaled(ray, inverse), sound, weighed, rays.dtype)
 
 
 def describe_rays(
@@ -116,32 +119,31 @@ def describe_rays(
     }
     if covariance:
         # The noise of a ray, times the distance, moves its line across itself alone.
-        share = safe_divide(weights.squared.expand_as(along), squared_length(offset), used)
-        share = safe_divide(share, squared_length(offset), used)
+        distance = dot(offset, offset)
+        share = safe_divide(weights.squared.expand_as(along), distance, used)
+        share = safe_divide(share, distance, used)
         x, y, z = offset
         xx, yy, zz = x * x, y * y, z * z
         entries = (yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy)
-        xx, xy, xz, yy, yz, zz = ((share * entry).sum(dim=-2) for entry in entries)
-        inverse = inverse_information((xx, xy, xz, yy, yz, zz), used.sum(dim=-2) >= 2)
+        information = [(share * entry).sum(dim=-2) for entry in entries]
+        inverse = inverse_information(information, used.sum(dim=-2) >= 2)
         found["covariance"] = unscaled(inverse, weights.largest.squeeze(-2))
     return found
 
 
 def angles_of(seen: Bearings, offset: Vector3, used: Tensor) -> tuple[Tensor, Tensor]:
     """Lengths along the rays of :meth:`Bearings.offsets`, m; angles from the used ones, rad."""
-    along = dot(seen.directions, offset)
+    along, beside = dot(seen.directions, offset), across(seen.directions, offset)
     # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
-    sine = safe_sqrt(torch.where(used, squared_length(across(seen.directions, offset)), 0.0))
+    sine = safe_sqrt(torch.where(used, dot(beside, beside), 0.0))
     return along, torch.atan2(sine, torch.where(used, along, 1.0))
-
-
-def dot(a: Vector3, b: Vector3) -> Tensor:
-    """Products of vectors whose components broadcast."""
-    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
 
 
 def across(directions: Vector3, vector: Vector3) -> Vector3:
     """The part of vectors orthogonal to unit directions."""
-    along = dot(directions, vector)
-    x, y, z = (part - d * along for part, d in zip(vector, directions, strict=True))
-    return x, y, z
+    return minus(vector, dot(directions, vector), directions)
+
+
+def _largest(vector: Vector3) -> Tensor:
+    x, y, z = vector
+    return torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())

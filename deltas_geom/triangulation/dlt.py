@@ -35,8 +35,7 @@ def normal_matrix(
     Args:
         coefficients: ``(*B, V, 4, K (K + 1) / 2)`` of the cameras, see
             :func:`normal_coefficients`.
-        x: ``(*B, V, N)`` px.
-        y: ``(*B, V, N)`` px.
+        x, y: ``(*B, V, N)`` px.
         squared: ``(*B, V, N)`` squared weights of the equations, or ``(*B, V, 1)``.
 
     Returns:

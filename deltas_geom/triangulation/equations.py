@@ -6,9 +6,10 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.numerics.chunks import joined
-from deltas_geom.numerics.ldl import Symmetric4, Vector4
 from deltas_geom.numerics.sums import over_views
+from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     Cameras,
@@ -16,6 +17,7 @@ from deltas_geom.triangulation.observed import (
     cameras_of,
     homogeneous_in_views,
 )
+from deltas_geom.triangulation.reprojection import in_views
 from deltas_geom.triangulation.rig_frame import (
     Moments,
     RigFrame,
@@ -50,14 +52,14 @@ class Rig(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """What N points have to satisfy.
+    """What N points have to satisfy: :class:`Linear`.
 
     Attributes:
         rig: the cameras.
         frame: in which each point is solved.
         normal: ten ``(*B, N)``, in that frame.
         parts: what is seen of the points, some at a time.
-        eps: rounding of the inputs, relative.
+        dtype: of the inputs.
         fixed: the frame is the world's: it depends on no camera and no weight.
     """
 
@@ -65,8 +67,40 @@ class Equations(NamedTuple):
     frame: RigFrame
     normal: Symmetric4
     parts: Sequence[Observations]
-    eps: float
+    dtype: torch.dtype
     fixed: bool
+
+    @property
+    def datum(self) -> Tensor:
+        """As of :class:`Linear`."""
+        return self.rig.datum
+
+    def product(self, x: Vector4) -> Vector4:
+        """As of :class:`Linear`."""
+        near, origin = self.rig.near, self.frame.origin
+
+        def summed(part: Observations, *place: Tensor) -> tuple[Tensor, ...]:
+            x, y, weights = part
+            a, b, c = homogeneous_in_views(near, place)
+            across, down = (x * c - a) * weights.squared, (y * c - b) * weights.squared
+            sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
+            return over_views(near.flatten(-3, -2).mT, sums)
+
+        *sums, last = self.each(summed, *out_of_frame(self.frame, x))
+        return (*sums, (dot(origin, tuple(sums)) + last) / self.frame.unit)
+
+    def in_front(self, points: Vector3) -> Tensor:
+        """As of :class:`Linear`."""
+        # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
+        row = self.rig.near[..., 2, :]
+
+        def nearest(part: Observations, *points: Tensor) -> tuple[Tensor]:
+            depth, unused = in_views(row, points), part.weights.unused
+            if not surely_all(~unused):
+                depth = torch.where(unused, 1.0, depth)
+            return (depth.amin(dim=-2),)
+
+        return self.each(nearest, *points)[0] > 0
 
     def each(
         self,
@@ -121,11 +155,11 @@ class Alike(NamedTuple):
     coefficients: Tensor
 
 
-def alike_of(rig: Rig, frame: Frame, eps: float) -> Alike:
+def alike_of(rig: Rig, frame: Frame, dtype: torch.dtype) -> Alike:
     """What points without weights and mask share."""
     like = rig.cameras.proj[..., :1]
     weights = weigh(None, None, batch=like.shape[:-3], like=like, sound=None)
-    framed = _framed(rig, rig_sums(rig.moments, weights), frame, eps)
+    framed = _framed(rig, rig_sums(rig.moments, weights), frame, dtype)
     # Few cameras are moved, not every matrix.
     return Alike(framed, normal_coefficients(cameras_in_frame(rig.near, framed.held())))
 
@@ -135,7 +169,7 @@ def equations_of(
     parts: Sequence[Observations],
     *,
     frame: Frame,
-    eps: float,
+    dtype: torch.dtype,
     alike: Alike | None = None,
 ) -> Equations:
     """The equations of what cameras see.
@@ -144,35 +178,34 @@ def equations_of(
         rig: of the cameras.
         parts: pixels and weights, of some points each.
         frame: "rig" or "world".
-        eps: rounding of the inputs, relative.
+        dtype: of the inputs.
         alike: of points without weights and mask.
     """
     (sound,) = _of_all([(part.weights.sound,) for part in parts], parts)
     if alike is None:
         sums = zip(*(rig_sums(rig.moments, part.weights) for part in parts), strict=True)
         weighted, counted = (_of_all(list(rows), parts) for rows in sums)
-        framed = _framed(rig, (weighted, counted), frame, eps)
+        framed = _framed(rig, (weighted, counted), frame, dtype)
     else:
         framed = alike.frame
     coefficients = rig.coefficients if alike is None else alike.coefficients
     made = [normal_matrix(coefficients, x, y, weights.squared) for x, y, weights in parts]
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = _of_all(made, parts)
-    normal = m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+    normal = _of_all(made, parts)
     if alike is None:
         held = framed.held()
         normal = in_frame(normal, held.origin, held.unit)
     framed = framed._replace(finite=framed.finite & sound)
-    return Equations(rig, framed, normal, parts, eps, frame == "world")
+    return Equations(rig, framed, normal, parts, dtype, frame == "world")
 
 
 def _framed(
-    rig: Rig, sums: tuple[tuple[Tensor, ...], tuple[Tensor, ...]], frame: Frame, eps: float
+    rig: Rig, sums: tuple[tuple[Tensor, ...], tuple[Tensor, ...]], frame: Frame, dtype: torch.dtype
 ) -> RigFrame:
-    found = rig_frame(*sums, eps=eps)
+    found = rig_frame(*sums, eps=torch.finfo(dtype).eps)
     if frame == "rig":
         return found
-    ox, oy, oz = (-place.expand_as(found.unit) for place in rig.datum.unbind(dim=-1))
-    return found._replace(origin=(ox, oy, oz), unit=torch.ones_like(found.unit))
+    origin = tuple(-place.expand_as(found.unit) for place in rig.datum.unbind(dim=-1))
+    return found._replace(origin=origin, unit=torch.ones_like(found.unit))
 
 
 def _of_all(
@@ -196,23 +229,7 @@ def cameras_in_frame(proj: Tensor, frame: RigFrame) -> Tensor:
     return torch.cat([rows.expand(*last.shape[:-1], 3), last], dim=-1)
 
 
-def product_of(equations: Equations, v: Vector4) -> Vector4:
-    """A^T W^2 (A v) in the frame: the normal matrix times v, unsquared."""
-    frame, near = equations.frame, equations.rig.near
-
-    def summed(part: Observations, *place: Tensor) -> tuple[Tensor, ...]:
-        x, y, weights = part
-        a, b, c = homogeneous_in_views(near, place)
-        across, down = (x * c - a) * weights.squared, (y * c - b) * weights.squared
-        sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
-        return over_views(near.flatten(-3, -2).mT, sums)
-
-    g0, g1, g2, g3 = equations.each(summed, *out_of_frame(frame, v))
-    ox, oy, oz = frame.origin
-    return g0, g1, g2, (ox * g0 + oy * g1 + oz * g2 + g3) / frame.unit
-
-
 def out_of_frame(frame: RigFrame, v: Vector4) -> Vector4:
     """T v, where :func:`in_frame` takes M to T^T M T."""
-    (ox, oy, oz), w = frame.origin, v[3] / frame.unit
-    return torch.addcmul(v[0], ox, w), torch.addcmul(v[1], oy, w), torch.addcmul(v[2], oz, w), w
+    w = v[3] / frame.unit
+    return (*plus(v[:3], w, frame.origin), w)

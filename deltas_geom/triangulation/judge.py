@@ -6,11 +6,20 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.status import Status
 
+REASONS = (
+    Status.BEHIND_CAMERA,
+    Status.AT_INFINITY,
+    Status.NO_PARALLAX,
+    Status.TOO_FEW_VIEWS,
+    Status.NOT_FINITE_INPUT,
+)
+"""Of several the last one counts."""
+
 
 def judge(
     *, finite: Tensor, enough: Tensor, posed: Tensor, near: Tensor, in_front: Tensor
 ) -> Tensor:
-    """Status ``(*B, N)`` int8; of several reasons the first one here counts.
+    """Status ``(*B, N)`` int8; of several reasons to fail the first one here counts.
 
     Args:
         finite: ``(*B, N)`` bool: everything that is used is finite.
@@ -20,16 +29,10 @@ def judge(
         in_front: that is in front of all of them.
     """
     status = torch.zeros_like(in_front, dtype=torch.int8)
-    reasons = (
-        (in_front, Status.BEHIND_CAMERA),
-        (near, Status.AT_INFINITY),
-        (posed, Status.NO_PARALLAX),
-        (enough, Status.TOO_FEW_VIEWS),
-        (finite, Status.NOT_FINITE_INPUT),
-    )
-    if all(surely_all(passed) for passed, _ in reasons):
+    passes = (in_front, near, posed, enough, finite)
+    if all(map(surely_all, passes)):
         return status
-    for passed, reason in reasons:
+    for passed, reason in zip(passes, REASONS, strict=True):
         status = torch.where(passed, status, status.new_full((), reason.value))
     return status
 

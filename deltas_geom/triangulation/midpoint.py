@@ -11,19 +11,17 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.sums import over_views
+from deltas_geom.numerics.vectors import Vector3, dot, either, scaled
 from deltas_geom.triangulation.bearings import (
     Bearings,
     across,
     check_bearings,
     describe_rays,
-    dot,
     see_rays,
 )
 from deltas_geom.triangulation.judge import judge, ok
-from deltas_geom.triangulation.observed import Vector3
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
-from deltas_geom.triangulation.rig_frame import squared_length
 
 
 @without_autocast
@@ -143,28 +141,26 @@ def _triangulate(
 def _midpoint(seen: Bearings) -> tuple[Vector3, Tensor]:
     """The points nearest to the lines, and what :func:`_nearest` says of the directions."""
     zero = torch.zeros_like(seen.datum[..., 0])
-    x, y, z = (-part for part in seen.offsets((zero, zero, zero)))  # the centres
-    return _nearest(seen.directions, seen.weights.squared, across(seen.directions, (x, y, z)))
+    centers = tuple(-part for part in seen.offsets((zero, zero, zero)))
+    return _nearest(seen.directions, seen.weights.squared, across(seen.directions, centers))
 
 
 def _stepped(seen: Bearings, points: Vector3, valid: Tensor) -> Vector3:
     """Points after one step of Gauss-Newton on the sines, where it stays in front."""
     # What has failed passes no gradient and no NaN.
-    x, y, z = (torch.where(valid, component, 0.0) for component in points)
-    offset, used = seen.offsets((x, y, z)), ~seen.weights.unused & valid.unsqueeze(-2)
-    squared = torch.where(used, squared_length(offset), 1.0)
-    inverse = squared.rsqrt()
-    towards = offset[0] * inverse, offset[1] * inverse, offset[2] * inverse
+    points = either(valid, points, (0.0,) * 3)
+    offset, used = seen.offsets(points), ~seen.weights.unused & valid.unsqueeze(-2)
+    squared = torch.where(used, dot(offset, offset), 1.0)
+    towards = scaled(offset, squared.rsqrt())
     # The change of a sine: its numerator's, and its denominator's, which is what keeps points
     # from coming nearer only because all distances shrink there.
     target = across(towards, across(seen.directions, offset))
     weight = torch.where(used, seen.weights.squared, 0.0) / squared
     largest = weight.detach().amax(dim=-2, keepdim=True)
     weight = weight / torch.where((largest > 0) & largest.isfinite(), largest, 1.0)
-    (dx, dy, dz), _ = _nearest(towards, weight, target)
-    nx, ny, nz = x - dx, y - dy, z - dz
-    good = seen.in_front((nx, ny, nz))
-    return torch.where(good, nx, x), torch.where(good, ny, y), torch.where(good, nz, z)
+    change, _ = _nearest(towards, weight, target)
+    near = tuple(x - by for x, by in zip(points, change, strict=True))
+    return either(seen.in_front(near), near, points)
 
 
 def _nearest(directions: Vector3, weight: Tensor, target: Vector3) -> tuple[Vector3, Tensor]:
@@ -205,10 +201,10 @@ def _judge(seen: Bearings, points: Vector3, share: Tensor) -> Tensor:
     counted = seen.weights.used
     count, *sums = over_views(moments, counted)
     total = count.clamp(min=1)
-    square, size, mx, my, mz = (part / total for part in sums)
+    square, size, *middle = (part / total for part in sums)
     # Of the cameras, squared, all alike: their spread, and the part of it across the rays.
-    reach = square - squared_length((mx, my, mz))
-    along = dot(seen.directions, seen.offsets((mx, my, mz))) * counted
+    reach = square - dot(tuple(middle), tuple(middle))
+    along = dot(seen.directions, seen.offsets(tuple(middle))) * counted
     beside = reach - along.square().sum(dim=-2) / total
     # Cameras closer together than the rounding of where they are, or in line with the point.
     posed = reach > (64 * eps) ** 2 * size + least * square

@@ -10,14 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.cameras.homogeneous import safe_divide
+from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
 from deltas_geom.numerics.chunks import serial_points
 from deltas_geom.numerics.sums import product
-from deltas_geom.triangulation.weights import Weights, check_weights, weigh
-
-Vector3 = tuple[Tensor, Tensor, Tensor]
-"""Components of vectors: struct of arrays, which is fast and compiles into one loop."""
+from deltas_geom.triangulation.weights import Weights, weigh
 
 
 class Cameras(NamedTuple):
@@ -50,8 +48,7 @@ class Observations(NamedTuple):
     """Pixels of N points in V views.
 
     Attributes:
-        x: ``(*B, V, N)`` px, 0 where not finite.
-        y: ``(*B, V, N)`` px, likewise.
+        x, y: ``(*B, V, N)`` px, 0 where not finite.
         weights: of the pixels.
     """
 
@@ -125,9 +122,18 @@ def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
 def check_observed(
     proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> torch.Size:
-    """:func:`check_weights` of pixels ``(*B, V, N, 2)`` seen by cameras ``(*B, V, 3, 4)``."""
-    check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"))
-    return check_weights(weights, mask, "pixels", pixels, "V N 2", proj.shape[:-3])
+    """The batch dims of pixels ``(*B, V, N, 2)`` seen by cameras ``(*B, V, 3, 4)``.
+
+    Raise unless weights and mask ``(*B, V, N)`` fit both, and the mask is bool.
+    """
+    batch = check_batch(
+        proj=(proj, "+V 3 4"),
+        pixels=(pixels, "V N 2"),
+        weights=(weights, "V N"),
+        mask=(mask, "V N"),
+    )
+    check_bool(mask=mask)
+    return batch
 
 
 def projection_centers(proj: Tensor) -> Tensor:
@@ -137,25 +143,24 @@ def projection_centers(proj: Tensor) -> Tensor:
 
     Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
     """
-    cofactors, inverse = inverted(proj[..., :3])
-    return -inverse[..., None] * (cofactors * proj[..., 3:]).sum(dim=-2)
+    inverse, _ = inverted(proj[..., :3])
+    return -(inverse * proj[..., 3:].mT).sum(dim=-1)
 
 
 def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Cofactors ``(*B, 3, 3)``, whose transpose by the determinant is the inverse, and 1 by that.
+    """Inverses ``(*B, 3, 3)``, 0 with zero gradient if singular within rounding; are they regular?
 
-    Both are 0, with zero gradient, where the matrix is singular within rounding.
+    Regular is ``(*B, 1, 1)``.
     """
     cofactors = torch.linalg.cross(matrix.roll(-1, dims=-2), matrix.roll(-2, dims=-2))
-    determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(dim=-1)
+    determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(dim=-1)[..., None, None]
     with torch.no_grad():
-        product = torch.linalg.vector_norm(matrix, dim=-1).prod(dim=-1)
-        exists = determinant.abs() > 4 * torch.finfo(matrix.dtype).eps * product
-    if surely_all(exists):
-        return cofactors, determinant.reciprocal()
-    # Double where: a singular camera must not turn the gradient into NaN.
-    inverse = torch.where(exists, 1 / torch.where(exists, determinant, 1.0), 0.0)
-    return torch.where(exists[..., None, None], cofactors, 0.0), inverse
+        product = torch.linalg.vector_norm(matrix, dim=-1).prod(dim=-1)[..., None, None]
+        size, limits = determinant.abs(), torch.finfo(matrix.dtype)
+        # The square of the determinant, in the gradient, has to be representable.
+        regular = (size > limits.tiny**0.4) & (size < limits.max**0.4)
+        regular = regular & (size > 4 * limits.eps * product)
+    return safe_divide(cofactors.mT, determinant, regular), regular
 
 
 def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:

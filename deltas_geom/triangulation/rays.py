@@ -12,25 +12,17 @@ import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import without_autocast
-from deltas_geom.numerics.ldl import Symmetric4, Vector4
+from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus, scaled
 from deltas_geom.triangulation.bearings import (
     Bearings,
     across,
     check_bearings,
     describe_rays,
-    dot,
     see_rays,
 )
-from deltas_geom.triangulation.observed import Vector3
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
-from deltas_geom.triangulation.rig_frame import (
-    RigFrame,
-    camera_moments,
-    rig_frame,
-    rig_sums,
-    squared_length,
-)
+from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame, rig_sums
 from deltas_geom.triangulation.solution import follow_linear, solve_linear
 
 
@@ -120,15 +112,10 @@ class _Posed(NamedTuple):
         return self.seen.in_front(points)
 
     def product(self, x: Vector4) -> Vector4:
-        last = x[3].unsqueeze(-2)
-        l0, l1, l2 = (
-            torch.addcmul(place.unsqueeze(-2), offset, last)
-            for place, offset in zip(x[:3], self.offset, strict=True)
-        )
-        squared = self.seen.weights.squared
-        a0, a1, a2 = (part * squared for part in across(self.seen.directions, (l0, l1, l2)))
-        g3 = dot((a0, a1, a2), self.offset).sum(dim=-2)
-        return a0.sum(dim=-2), a1.sum(dim=-2), a2.sum(dim=-2), g3
+        *place, last = (component.unsqueeze(-2) for component in x)
+        lines = plus(tuple(place), last, self.offset)
+        beside = scaled(across(self.seen.directions, lines), self.seen.weights.squared)
+        return tuple(part.sum(dim=-2) for part in (*beside, dot(beside, self.offset)))
 
 
 def _pose(
@@ -140,9 +127,9 @@ def _pose(
     frame = frame._replace(finite=frame.finite & seen.weights.sound)
     held = frame.held()
     unit = held.unit.unsqueeze(-2)
-    o0, o1, o2 = (part / unit for part in seen.offsets(held.origin))
-    normal = _normal_matrix(seen.directions, (o0, o1, o2), seen.weights.squared)
-    return _Posed(seen, (o0, o1, o2), frame, normal)
+    offset = tuple(part / unit for part in seen.offsets(held.origin))
+    normal = _normal_matrix(seen.directions, offset, seen.weights.squared)
+    return _Posed(seen, offset, frame, normal)
 
 
 def _normal_matrix(directions: Vector3, offset: Vector3, squared: Tensor) -> Symmetric4:
@@ -155,7 +142,6 @@ def _normal_matrix(directions: Vector3, offset: Vector3, squared: Tensor) -> Sym
         w - v0 * d0, -v0 * d1, -v0 * d2, w * a0,
         w - v1 * d1, -v1 * d2, w * a1,
         w - v2 * d2, w * a2,
-        w * squared_length((a0, a1, a2)),
+        w * dot((a0, a1, a2), (a0, a1, a2)),
     )  # fmt: skip
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (entry.sum(dim=-2) for entry in entries)
-    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+    return tuple(entry.sum(dim=-2) for entry in entries)

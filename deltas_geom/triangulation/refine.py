@@ -6,7 +6,7 @@ triangulated in the rig frame one step is enough for all but gross outliers.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,18 +17,18 @@ from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.numerics.sums import over_views
-from deltas_geom.numerics.symmetric3 import Symmetric3, solve3_scaled
+from deltas_geom.numerics.symmetric3 import solve3_scaled
+from deltas_geom.numerics.vectors import Symmetric3, Vector3, either
 from deltas_geom.records import Record
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     Observations,
-    Vector3,
     cameras_of,
+    check_observed,
     homogeneous_in_views,
     observe,
 )
 from deltas_geom.triangulation.robust_loss import Loss, robust_loss, second_derivative
-from deltas_geom.triangulation.weights import check_weights
 
 _Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
@@ -111,9 +111,9 @@ def refine_points(
         >>> refined.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    check_shapes(proj=(proj, "+V 3 4"), pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    batch = batch_shape(proj.shape[:-3], points.shape[:-2])
-    check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
+    batch = check_observed(proj, pixels, weights, mask)
+    check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
+    batch_shape(batch, points.shape[:-2])
     if loss not in ("squared", "huber", "cauchy"):
         raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy', got {loss!r}")
     if gradient not in ("unrolled", "implicit"):
@@ -153,10 +153,16 @@ class _Problem(NamedTuple):
     limit: float
 
 
-def _pose(robust: _Loss, proj: Tensor, pixels: Tensor, points: Tensor, *weighed: Any) -> _Problem:
+def _pose(
+    robust: _Loss,
+    proj: Tensor,
+    pixels: Tensor,
+    points: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+) -> _Problem:
     cameras = cameras_of(proj)
-    batch = check_weights(weighed[0], weighed[1], "pixels", pixels, "V N 2", proj.shape[:-3])
-    observed = observe(pixels, weighed[0], weighed[1], batch)
+    observed = observe(pixels, weights, mask, check_observed(proj, pixels, weights, mask))
     place = points.mT.to(observed.x.dtype).contiguous()
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
@@ -213,26 +219,26 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
 
 
 def _descend(problem: _Problem, steps: int) -> _End:
-    x, y, z = problem.start.unbind(dim=-2)
-    fit = _fit(problem, (x, y, z))
+    points: Vector3 = problem.start.unbind(dim=-2)
+    fit = _fit(problem, points)
     error, cost, valid = fit.error, fit.cost, problem.sound & (fit.cost < torch.inf)
     noise, moving = _rounding(problem, fit), valid
     for step in range(steps):
-        (dx, dy, dz), determined = solve3_scaled(*_normal_equations(problem, fit))
+        change, determined = solve3_scaled(*_normal_equations(problem, fit))
         if step == 0:
             moving = valid = valid & determined
-        nx, ny, nz = x + dx, y + dy, z + dz
-        near = nx.detach().abs() + ny.detach().abs() + nz.detach().abs() < problem.limit
-        moving = moving & determined & near
-        nx, ny, nz = (torch.where(moving, b, a) for a, b in ((x, nx), (y, ny), (z, nz)))
-        fit = _fit(problem, (nx, ny, nz))
+        moved = tuple(x + by for x, by in zip(points, change, strict=True))
+        x, y, z = (component.detach().abs() for component in moved)
+        moving = moving & determined & (x + y + z < problem.limit)
+        moved = either(moving, moved, points)
+        fit = _fit(problem, moved)
         # Rounding must not refuse a step at the optimum, of which it carries the gradient.
         rounded = cost * (1 + 32 * torch.finfo(cost.dtype).eps) + noise
         # What is refused once would be refused again: from there the fit does not matter.
         moving = moving & (fit.cost < torch.add(rounded, safe_sqrt(cost * noise), alpha=2))
-        x, y, z = (torch.where(moving, b, a) for a, b in ((x, nx), (y, ny), (z, nz)))
-        error, cost = torch.where(moving, fit.error, error), torch.where(moving, fit.cost, cost)
-    return (x, y, z), error, valid
+        points = either(moving, moved, points)
+        error, cost = either(moving, (fit.error, fit.cost), (error, cost))
+    return points, error, valid
 
 
 @torch.no_grad()
@@ -252,14 +258,11 @@ def _normal_equations(problem: _Problem, fit: _Fit) -> tuple[Symmetric3, Vector3
     directions, (x, y), (dx, dy) = problem.proj[..., :3], fit.place, fit.offset
     once = problem.observed.weights.squared * fit.influence * fit.inverse
     # The derivative of a pixel by the point is its equations, divided by the depth.
-    m00, m01, m02, m11, m12, m22 = normal_matrix(
-        normal_coefficients(directions), x, y, once * fit.inverse
-    )
+    normal = normal_matrix(normal_coefficients(directions), x, y, once * fit.inverse)
     across, down = dx * once, dy * once
     terms = torch.stack([across, down, torch.addcmul(across * x, down, y)], dim=-2)
     rows = torch.cat([-directions[..., :2, :], directions[..., 2:, :]], dim=-2).flatten(-3, -2)
-    r0, r1, r2 = over_views(rows.mT, terms.flatten(-3, -2))
-    return (m00, m01, m02, m11, m12, m22), (r0, r1, r2)
+    return normal, over_views(rows.mT, terms.flatten(-3, -2))
 
 
 def _descend_implicitly(problem: _Problem, steps: int) -> _End:
@@ -270,21 +273,20 @@ def _descend_implicitly(problem: _Problem, steps: int) -> _End:
     """
     with torch.no_grad():
         end, _, valid = _descend(problem, steps)
-    x, y, z = (component.detach() for component in end)
-    fit = _fit(problem, (x, y, z))
+    end = tuple(component.detach() for component in end)
+    fit = _fit(problem, end)
     normal, right = _normal_equations(problem, fit)
     seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
     with torch.no_grad():
         counted = squared * fit.influence, squared * fit.bend
         hessian = second_derivative(normal, problem.proj, *seen, *counted)
-    h00, h01, h02, h11, h12, h22 = (entry.detach() for entry in hessian)
-    change, strict = solve3_scaled((h00, h01, h02, h11, h12, h22), right)
-    px, py, pz = (
+    change, strict = solve3_scaled(tuple(entry.detach() for entry in hessian), right)
+    points = tuple(
         # A gradient of 0 to the start, not a missing one; of the step no value.
         p + 0 * s + torch.where(strict & valid, d - d.detach(), 0.0)
-        for p, s, d in zip((x, y, z), problem.start.unbind(dim=-2), change, strict=True)
+        for p, s, d in zip(end, problem.start.unbind(dim=-2), change, strict=True)
     )
-    return (px, py, pz), _fit(problem, (px, py, pz)).error, valid
+    return points, _fit(problem, points).error, valid
 
 
 def _outward(

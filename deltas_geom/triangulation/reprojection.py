@@ -8,15 +8,15 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.numerics.arithmetic import surely_all
-from deltas_geom.triangulation.observed import Vector3, homogeneous_in_views
+from deltas_geom.numerics.vectors import Vector3
+from deltas_geom.triangulation.observed import homogeneous_in_views
 
 
 class Reprojection(NamedTuple):
     """Points as views see them.
 
     Attributes:
-        x: ``(*B, V, N)`` px; 0 where not seen.
-        y: ``(*B, V, N)`` px.
+        x, y: ``(*B, V, N)`` px; 0 where not seen.
         inverse: ``(*B, V, N)`` 1 / depth; 0 where not seen.
         depth: ``(*B, V, N)``.
         seen: ``(*B, V, N)`` bool, used, in front and not infinitely far to the side.

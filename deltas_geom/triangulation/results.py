@@ -139,6 +139,13 @@ class RobustTriangulation(Record):
         return without(self, outside, Status.OUT_OF_RANGE)
 
 
+def of_inliers(found: Triangulation, inliers: Tensor, reason: Tensor) -> RobustTriangulation:
+    """What is known of points by their inliers ``(*B, V, N)``; why not, where there are none."""
+    status = torch.where(inliers.any(dim=-2), found.status, reason)
+    inliers = inliers & found.valid.unsqueeze(-2)
+    return RobustTriangulation(**found._replace(status=status)._asdict(), inliers=inliers)
+
+
 def beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
     """Which depths are nearer or farther than a range (near, far), metres."""
     check_depth_range(depth_range)

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all
-from deltas_geom.numerics.ldl import Symmetric4
 from deltas_geom.numerics.sums import over_views
-from deltas_geom.triangulation.observed import Vector3
+from deltas_geom.numerics.vectors import Symmetric4, Vector3, dot, scaled
 from deltas_geom.triangulation.weights import Weights
 
 
@@ -42,8 +41,8 @@ class RigFrame(NamedTuple):
 
     def held(self) -> "RigFrame":
         """The frame in which matrices are made: what depends on it is known without them."""
-        ox, oy, oz = (part.detach() for part in self.origin)
-        return self._replace(origin=(ox, oy, oz), unit=self.unit.detach())
+        origin = tuple(part.detach() for part in self.origin)
+        return self._replace(origin=origin, unit=self.unit.detach())
 
 
 def datum_of(centers: Tensor) -> Tensor:
@@ -90,17 +89,17 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         counted: seven ``(*B, N)``, the second, each used view once.
         eps: rounding of the inputs, relative.
     """
-    total, square, x, y, z = weighted
+    total, square, *offset = weighted
     # The largest squared weight is 1: less is no view, and its sums are 0.
     total = total.clamp(min=1)
     inverse = total.reciprocal()
-    origin = (x * inverse, y * inverse, z * inverse)
-    spread = square * inverse - squared_length(origin)
+    origin = scaled(tuple(offset), inverse)
+    spread = square * inverse - dot(origin, origin)
     with torch.no_grad():
-        count, size, mx, my, mz, from_world, broken = counted
+        count, size, *offset, from_world, broken = counted
         share = count.clamp(min=1).reciprocal()
-        size, middle = size * share, (mx * share, my * share, mz * share)
-        reach = size - squared_length(middle)
+        size, middle = size * share, scaled(tuple(offset), share)
+        reach = size - dot(middle, middle)
         # Centres closer together than the rounding of where they are do not differ.
         least = (64 * eps) ** 2 * share * from_world
         least = torch.maximum(least, 16 * torch.finfo(size.dtype).eps * size)
@@ -111,12 +110,6 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         spread = torch.where(apart, spread, 1.0)
     length = spread * spread.rsqrt()  # not sqrt, for which torch starts threads
     return RigFrame(origin, length, total, middle, reach, posed, enough, broken == 0)
-
-
-def squared_length(vector: Vector3) -> Tensor:
-    """``(*B, N)`` of vectors three ``(*B, N)``."""
-    x, y, z = vector
-    return torch.addcmul(torch.addcmul(x * x, y, y), z, z)
 
 
 def in_frame(normal: Symmetric4, origin: Vector3, length: Tensor) -> Symmetric4:

@@ -21,7 +21,7 @@ from deltas_geom.status import Status
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.observed import check_observed, clean_pixels
 from deltas_geom.triangulation.pairs import pairs_of, points_of_pairs
-from deltas_geom.triangulation.results import RobustTriangulation
+from deltas_geom.triangulation.results import RobustTriangulation, of_inliers
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
 from deltas_geom.triangulation.weights import weigh
 
@@ -108,9 +108,7 @@ def triangulate_robust(
         ]
         inliers, reason = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
     found = Call(known, pixels, weights, inliers, "rig").full(covariance=covariance)
-    status = torch.where(inliers.any(dim=-2), found.status, reason)
-    inliers = inliers & found.valid.unsqueeze(-2)
-    return RobustTriangulation(**found._replace(status=status)._asdict(), inliers=inliers)
+    return of_inliers(found, inliers, reason)
 
 
 class _Observations(NamedTuple):

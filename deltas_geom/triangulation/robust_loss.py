@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.symmetric3 import Symmetric3
+from deltas_geom.numerics.vectors import Symmetric3
 
 Loss = Literal["squared", "huber", "cauchy"]
 
@@ -59,8 +59,5 @@ def second_derivative(
         bent = bend * slope[i] * slope[j] - turn[i] * slope[j] - turn[j] * slope[i]
         return bent.sum(dim=-2)
 
-    m00, m01, m02, m11, m12, m22 = normal
-    return (
-        m00 + entry(0, 0), m01 + entry(0, 1), m02 + entry(0, 2),
-        m11 + entry(1, 1), m12 + entry(1, 2), m22 + entry(2, 2),
-    )  # fmt: skip
+    places = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    return tuple(m + entry(*place) for m, place in zip(normal, places, strict=True))

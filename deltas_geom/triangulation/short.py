@@ -2,7 +2,7 @@
 
 What 17 joints of a person cost is the number of operations, not their size. NumPy's take a third of
 the time of torch's, so these are NumPy's, in float64, with the gradient spelled out. The frames are
-those of `rig_frame`, the reasons of failures those of `judge`; N comes before V here.
+those of `rig_frame`, the reasons of failures those of `judge`. N comes before V here.
 """
 
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deltas_geom.status import Status
+from deltas_geom.triangulation.judge import REASONS
 from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 Array = NDArray[Any]
@@ -235,16 +235,12 @@ def _null_vectors(equations: Array, *, exactly: bool) -> tuple[Array, Array]:
 
 
 def _judged(finite: Array, enough: Array, posed: Array, near: Array, ahead: Array) -> Array:
+    """As :func:`judge`."""
     in_front = ahead.all(axis=-1)
     status = np.zeros(in_front.shape, dtype=np.int8)
     if not (in_front & near & posed & enough & finite).all():
-        for passed, reason in (
-            (in_front, Status.BEHIND_CAMERA),
-            (near, Status.AT_INFINITY),
-            (posed, Status.NO_PARALLAX),
-            (enough, Status.TOO_FEW_VIEWS),
-            (finite, Status.NOT_FINITE_INPUT),
-        ):
+        passes = (in_front, near, posed, enough, finite)
+        for passed, reason in zip(passes, REASONS, strict=True):
             status = np.where(passed, status, np.int8(reason.value))
     return status
 

@@ -8,7 +8,7 @@ from deltas_geom.triangulation.equations import Frame
 from deltas_geom.triangulation.reprojection import reproject
 from deltas_geom.triangulation.short import Array, ShortRig, Solved, describe, solve
 from deltas_geom.triangulation.short_adjoint import gradients
-from deltas_geom.triangulation.uncertainty import covariance_of, representable, unpacked3
+from deltas_geom.triangulation.uncertainty import covariance_of, representable, unscaled
 
 
 class ShortWay:
@@ -77,12 +77,9 @@ class ShortWay:
             torch.from_numpy(one).mT for one in (solved.share, solved.used, solved.largest)
         )
         used = used & torch.from_numpy(solved.status == 0).unsqueeze(-2)
-        x, y, z = points.unbind(dim=-1)
-        noise = unpacked3(covariance_of(proj, reproject(proj, (x, y, z), used), share * share))
-        unit = largest.squeeze(-2)[..., None, None]
-        # Divided twice: the square of a small weight may be 0.
-        kind = torch.float64 if self.dtype.itemsize == 8 else torch.float32
-        return representable(noise / unit / unit, kind)
+        seen = reproject(proj, points.unbind(dim=-1), used)
+        noise = unscaled(covariance_of(proj, seen, share * share), largest.squeeze(-2))
+        return representable(noise, torch.float64 if self.dtype.itemsize == 8 else torch.float32)
 
     def _solve(self, *seen: Tensor | None) -> Solved:
         pixels, weights, mask = (None if t is None else t.detach().numpy() for t in seen)

@@ -3,18 +3,27 @@
 How the matrices were made, from pixels, rays or lists of observations, does not matter here.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all
-from deltas_geom.numerics.ldl import Symmetric4, Vector4, dot, less, multiply, unit
+from deltas_geom.numerics.ldl import multiply
 from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
+from deltas_geom.numerics.vectors import (
+    Symmetric4,
+    Vector3,
+    Vector4,
+    dot,
+    either,
+    minus,
+    plus,
+    scaled,
+    unit,
+)
 from deltas_geom.triangulation.judge import judge
-from deltas_geom.triangulation.observed import Vector3
-from deltas_geom.triangulation.rig_frame import RigFrame, squared_length
+from deltas_geom.triangulation.rig_frame import RigFrame
 
 # Of the inputs' rounding: an error of the solver that is lost in it.
 _NEGLIGIBLE = 0.01
@@ -58,102 +67,38 @@ class Solution(NamedTuple):
     vector: Vector4
 
 
+@torch.no_grad()
 def solve_linear(equations: Linear) -> tuple[Solution, Tensor]:
     """The points that minimise the algebraic error, without gradient, and their status."""
-    eps, frame = torch.finfo(equations.dtype).eps, equations.frame
+    info, frame, datum = torch.finfo(equations.dtype), equations.frame, equations.datum
     # What the normal matrix loses of the rows' digits matters to those who have them.
     polish = 2 if equations.dtype == torch.float64 else 0
 
     def product(x: Vector4) -> Vector4:  # a compiler takes no bound method
         return equations.product(x)
 
-    found = find_points(equations.normal, frame, eps=eps, product=product, polish=polish)
-    x, y, z = in_world(found.points, equations.datum)
-    held = x.abs() + y.abs() + z.abs() <= torch.finfo(equations.dtype).max
+    vector, simple = null_vector(
+        equations.normal, accuracy=_NEGLIGIBLE * info.eps, product=product, polish=polish
+    )
+    points = plus(frame.origin, frame.unit / vector[3], vector[:3])
+    beside = tuple(place - middle for place, middle in zip(points, frame.middle, strict=True))
+    near = (16 * info.eps) ** 2 * dot(beside, beside) <= frame.reach
+    x, y, z = in_world(points, datum)
     status = judge(
         finite=frame.finite,
         enough=frame.enough,
-        posed=found.posed,
-        near=found.near & held,
-        in_front=equations.in_front(found.points),
+        posed=frame.posed & simple,
+        near=near & (x.abs() + y.abs() + z.abs() <= info.max),
+        in_front=equations.in_front(points),
     )
-    return Solution(found.points, found.vector), status
+    return Solution(points, vector), status
 
 
 def follow_linear(equations: Linear, found: Solution, valid: Tensor) -> Solution:
     """The same, differentiably; finite where not valid."""
-    points = derivable_points(equations.normal, equations.frame, found.vector, valid)
-    return found._replace(points=points)
-
-
-class FoundPoints(NamedTuple):
-    """Points before they are judged; without gradient.
-
-    Attributes:
-        points: three ``(*B, N)``, relative to the origin of the sums; anything if there is none.
-        vector: homogeneous, in the frame, of any length and sign.
-        posed: ``(*B, N)`` bool: there is a place or a direction.
-        near: ``(*B, N)`` bool: there is a place.
-    """
-
-    points: Vector3
-    vector: Vector4
-    posed: Tensor
-    near: Tensor
-
-
-@torch.no_grad()
-def find_points(
-    normal: Symmetric4,
-    frame: RigFrame,
-    *,
-    eps: float,
-    product: Callable[[Vector4], Vector4] | None = None,
-    polish: int = 0,
-) -> FoundPoints:
-    """The points that minimise the algebraic error.
-
-    Args:
-        normal: ten ``(*B, N)``, of homogeneous points of :func:`in_frame`.
-        frame: of the points.
-        eps: rounding of the inputs, relative.
-        product: see :func:`deltas_geom.numerics.null_vector.null_vector`.
-        polish: see there.
-    """
-    (x0, x1, x2, x3), simple = null_vector(
-        normal, accuracy=_NEGLIGIBLE * eps, product=product, polish=polish
-    )
-    points = _at_distance((x0, x1, x2), frame.unit / x3, frame.origin)
-    (x, y, z), (mx, my, mz) = points, frame.middle
-    distance = squared_length((x - mx, y - my, z - mz))
-    near = (16 * eps) ** 2 * distance <= frame.reach
-    return FoundPoints(points, (x0, x1, x2, x3), frame.posed & simple, near)
-
-
-def _at_distance(direction: Vector3, distance: Tensor, origin: Vector3) -> Vector3:
-    (x, y, z), (ox, oy, oz) = direction, origin
-    return (
-        torch.addcmul(ox, x, distance),
-        torch.addcmul(oy, y, distance),
-        torch.addcmul(oz, z, distance),
-    )
-
-
-def derivable_points(
-    normal: Symmetric4, frame: RigFrame, vector: Vector4, valid: Tensor
-) -> Vector3:
-    """Points relative to the origin of the sums, differentiable; finite where not valid.
-
-    Args:
-        normal: as for :func:`find_points`, differentiable, but for the frame, which is held.
-        frame: of the points.
-        vector: found for ``normal``.
-        valid: ``(*B, N)`` bool.
-    """
-    matrix, _ = of_trace_one(normal, valid)
-    held = frame.held()
-    x0, x1, x2, x3 = derivable_vector(matrix, vector, valid, frame)
-    return _at_distance((x0, x1, x2), held.unit / x3, held.origin)
+    matrix, _ = of_trace_one(equations.normal, valid)
+    vector, held = _derivable(matrix, found.vector, valid, equations.frame), equations.frame.held()
+    return found._replace(points=plus(held.origin, held.unit / vector[3], vector[:3]))
 
 
 def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]:
@@ -165,16 +110,10 @@ def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]
     trace = torch.where(valid, normal[0] + normal[4] + normal[7] + normal[9], 1.0).detach()
     # Of trace 1, so that powers of its entries in the gradient neither overflow nor vanish.
     share = trace.reciprocal()
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
-        torch.where(valid, entry, constant) * share
-        for entry, constant in zip(normal, easy, strict=True)
-    )
-    return (m00, m01, m02, m03, m11, m12, m13, m22, m23, m33), share
+    return scaled(either(valid, normal, easy), share), share
 
 
-def derivable_vector(
-    matrix: Symmetric4, vector: Vector4, valid: Tensor, frame: RigFrame
-) -> Vector4:
+def _derivable(matrix: Symmetric4, vector: Vector4, valid: Tensor, frame: RigFrame) -> Vector4:
     """The null vector, of about unit length, as a function of the matrix and of the frame.
 
     Args:
@@ -183,15 +122,17 @@ def derivable_vector(
         valid: ``(*B, N)`` bool.
         frame: of the points, differentiable.
     """
-    x0, x1, x2, x3 = (
-        torch.where(valid, component.detach(), constant)
-        for component, constant in zip(vector, (0.0, 0.0, 0.0, 1.0), strict=True)
-    )
-    start = unit((x0, x1, x2, x3))
+    start = of_length_one(vector, valid)
     x0, x1, x2, x3 = rayleigh_step(_measured(matrix, start, valid, frame), start)
     # Below the step's rounding there is no derivative, and not even a sign to divide by.
     lost = start[3].abs() <= 4 * torch.finfo(x3.dtype).eps
     return x0, x1, x2, torch.where(lost, start[3], x3)
+
+
+def of_length_one(vector: Vector4, valid: Tensor) -> Vector4:
+    """Null vectors, without gradient; a place where not valid."""
+    held = tuple(component.detach() for component in vector)
+    return unit(either(valid, held, (0.0, 0.0, 0.0, 1.0)))
 
 
 def _measured(matrix: Symmetric4, x: Vector4, valid: Tensor, frame: RigFrame) -> Symmetric4:
@@ -214,22 +155,16 @@ def _measured(matrix: Symmetric4, x: Vector4, valid: Tensor, frame: RigFrame) ->
         b0 * b0 + b1 * b1 + b2 * b2,
     )  # fmt: skip
     mu = dot(x, multiply(matrix, x)) / (1 + dot(x, multiply(norm, x)))
-    m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = (
-        less(entry, mu, part) for entry, part in zip(matrix, norm, strict=True)
-    )
-    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33
+    return minus(matrix, mu, norm)
 
 
 def in_world(points: Vector3, datum: Tensor) -> Vector3:
     """Points in the world, from points relative to the origin of the sums ``(*B, 1, 3)``."""
-    (x, y, z), (ox, oy, oz) = points, datum.unbind(dim=-1)
-    return x + ox, y + oy, z + oz
+    return tuple(x + origin for x, origin in zip(points, datum.unbind(dim=-1), strict=True))
 
 
 def kept(points: Vector3, valid: Tensor) -> Vector3:
     """The valid ones of points three ``(*B, N)``, the others 0."""
     if surely_all(valid):
         return points
-    zero = points[0].new_zeros(())
-    x, y, z = (torch.where(valid, component, zero) for component in points)
-    return x, y, z
+    return either(valid, points, (0.0,) * 3)

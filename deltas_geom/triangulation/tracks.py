@@ -154,7 +154,7 @@ def triangulate_tracks(
 def _describe(
     posed: PosedTracks, found: Solution, valid: Tensor, covariance: bool
 ) -> dict[str, Tensor]:
-    (camera, px, py, weights, point), count = posed.listed, len(valid)
+    (camera, px, py, weights, point, *_), count = posed, len(valid)
     place = torch.stack(kept(in_world(found.points, posed.datum), valid))
     both, each = at(valid, point), at(place, point)
     used = ~weights.unused & both

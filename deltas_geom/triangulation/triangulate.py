@@ -110,8 +110,7 @@ class KnownCameras:
             clean, finite, centers = map(torch.from_numpy, (rig.proj, rig.finite, rig.centers))
             return Cameras(clean, (~finite).double(), centers), torch.from_numpy(rig.inverse)
         cameras = cameras_of(proj)
-        cofactors, inverse = inverted(cameras.proj[..., :3])
-        return cameras, cofactors.mT * inverse[..., None, None]
+        return cameras, inverted(cameras.proj[..., :3])[0]
 
     def _plain(self) -> bool:
         return values_at_hand(self.proj) and self.proj.dtype in _PLAIN
@@ -179,8 +178,7 @@ class Call:
         """Points ``(*B, N, 3)``."""
 
         def derivable(proj: Tensor, *seen: Any) -> tuple[Tensor]:
-            way = self.long(rig_of(proj))
-            return (way.outward(way.derive(way.see(*seen))[0]),)
+            return self.long(rig_of(proj)).points(*seen, derivable=True)
 
         def adjoint(
             gradients: tuple[Tensor], needed: tuple[bool, ...], *tensors: Any
@@ -195,9 +193,7 @@ class Call:
         """Points with all that is known about them."""
 
         def derivable(proj: Tensor, *seen: Any) -> tuple[Tensor, ...]:
-            way = self.long(rig_of(proj))
-            equations = way.see(*seen)
-            return way.described(equations, *way.derive(equations), covariance)
+            return self.long(rig_of(proj)).full(*seen, covariance=covariance, derivable=True)
 
         def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
             return self.way.full(*seen, covariance=covariance)

@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import batch_shape, check_bool, check_shapes
+from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.epipolar.fundamental import cross_matrix
 from deltas_geom.numerics.arithmetic import only, without_autocast
 from deltas_geom.numerics.sums import product
+from deltas_geom.numerics.vectors import Vector3, dot
 from deltas_geom.records import Record
 from deltas_geom.status import Status
-from deltas_geom.triangulation.bearings import dot
 from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
-from deltas_geom.triangulation.observed import Vector3, clean_pixels
+from deltas_geom.triangulation.observed import clean_pixels, inverted
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import reproject
 from deltas_geom.triangulation.results import beyond, refused_by_residual, without
@@ -107,11 +107,8 @@ def triangulate_two_view(
         >>> result.points.round(decimals=3), result.residual
         (tensor([[0.2000, 0.0000, 2.0000]]), tensor([2.]))
     """
-    check_shapes(proj=(proj, "2 3 4"), pixels=(pixels, "2 N 2"))
-    if mask is not None:
-        check_shapes(pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
-        check_bool(mask=mask)
-    batch_shape(*(t.shape[:-3] for t in (proj, pixels)), () if mask is None else mask.shape[:-2])
+    check_batch(proj=(proj, "2 3 4"), pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
+    check_bool(mask=mask)
     return operation(
         TwoViewTriangulation,
         (proj, pixels, mask),
@@ -141,26 +138,13 @@ class _Rig(NamedTuple):
 
 def _rig(proj: Tensor) -> _Rig:
     """Source: Hartley and Zisserman, 2nd ed., sections 6.2.4 and 9.2.2."""
-    inverse, regular = _inverse(proj[..., :3])
-    centers = -(inverse @ proj[..., 3:]).squeeze(-1) * regular.all(dim=-1)[..., None, None]
+    inverse, regular = inverted(proj[..., :3])
+    centers = -(inverse @ proj[..., 3:]).squeeze(-1) * regular[..., 0].all(dim=-2, keepdim=True)
     baseline = cross_matrix(centers.diff(dim=-2).squeeze(-2))
     fundamental = inverse[..., 0, :, :].mT @ baseline @ inverse[..., 1, :, :]
     largest = fundamental.detach().abs().amax(dim=(-2, -1), keepdim=True)
     exists = (largest > 0) & largest.isfinite()
     return _Rig(safe_divide(fundamental, largest, exists), inverse, centers)
-
-
-def _inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses ``(*B, 3, 3)``, 0 if singular within rounding; are they regular? ``(*B)``."""
-    r0, r1, r2 = matrix.unbind(dim=-2)
-    columns = [torch.linalg.cross(a, b) for a, b in ((r1, r2), (r2, r0), (r0, r1))]
-    determinant = (r0 * columns[0]).sum(dim=-1)
-    size, limits = determinant.detach().abs(), torch.finfo(matrix.dtype)
-    # The square of the determinant, in the gradient, has to be representable.
-    regular = (size > limits.tiny**0.4) & (size < limits.max**0.4)
-    regular = regular & (size > 4 * limits.eps * matrix.detach().norm(dim=-1).prod(dim=-1))
-    adjugate, exists = torch.stack(columns, dim=-1), regular[..., None, None]
-    return safe_divide(adjugate, determinant[..., None, None], exists), regular
 
 
 class _Seen(NamedTuple):
@@ -230,8 +214,8 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     size = safe(ray.detach().abs().amax(dim=-2))
     ray = ray / size.unsqueeze(-2)
     # By components, which costs half of torch.linalg.cross and its gradient.
-    first, second = (_components(one) for one in ray.unbind(dim=-3))
-    baseline = _components(rig.centers.diff(dim=-2).mT)
+    first, second = (one.unbind(dim=-2) for one in ray.unbind(dim=-3))
+    baseline = rig.centers.diff(dim=-2).mT.unbind(dim=-2)
     across = _cross(first, second)
     passing = _cross(baseline, second), _cross(baseline, first)
     squared = dot(across, across)
@@ -281,15 +265,10 @@ def _describe(seen: _Seen, solved: _Solved, valid: Tensor, covariance: bool) -> 
         "errors": safe_sqrt(squared),
     }
     if covariance:
-        again = reproject(seen.proj, _components(points), both.expand_as(squared))
+        again = reproject(seen.proj, points.unbind(dim=-2), both.expand_as(squared))
         noise = covariance_of(seen.proj, again, torch.ones_like(squared))
         found["covariance"] = unpacked3(noise)
     return found
-
-
-def _components(vector: Tensor) -> Vector3:
-    x, y, z = vector.unbind(dim=-2)
-    return x, y, z
 
 
 def _cross(a: Vector3, b: Vector3) -> Vector3:

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_bool, check_shapes, check_tensor
 from deltas_geom.numerics.arithmetic import at_least_in_single, solver_dtype, without_autocast
-from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3
+from deltas_geom.numerics.symmetric3 import inverse3
+from deltas_geom.numerics.vectors import Symmetric3, Vector3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
-from deltas_geom.triangulation.observed import Cameras, Vector3, cameras_of, clean_pixels
+from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed, clean_pixels
 from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
-from deltas_geom.triangulation.weights import check_weights, weigh
+from deltas_geom.triangulation.weights import weigh
 
 
 @without_autocast
@@ -36,14 +37,10 @@ def reprojection_residual(
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
         TypeError: ``proj`` is not floating point, or the mask not bool.
     """
-    check_shapes(
-        proj=(proj, "+V 3 4"),
-        points=(points, "N 3"),
-        pixels=(pixels, "V N 2"),
-        weights=(weights, "V N"),
-    )
-    batch = batch_shape(proj.shape[:-3], points.shape[:-2])
-    batch = check_weights(weights, mask, "pixels", pixels, "V N 2", batch)
+    check_tensor(weights=weights)
+    batch = check_observed(proj, pixels, weights, mask)
+    check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
+    batch = batch_shape(batch, points.shape[:-2])
     cameras, (places, known) = cameras_of(proj), _clean_points(points)
     x, y, sound = clean_pixels(pixels)
     healthy = (cameras.broken == 0).unsqueeze(-1)
@@ -73,9 +70,8 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
         TypeError: ``proj`` is not floating point, or ``used`` not bool.
     """
-    check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
+    check_batch(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
     check_bool(used=used)
-    batch_shape(proj.shape[:-3], points.shape[:-2], used.shape[:-2])
     cameras, (places, known) = cameras_of(proj.detach()), _clean_points(points.detach())
     broken = cameras.broken.unsqueeze(-1) > 0
     sound = known & ~(broken & used).any(dim=-2)
@@ -134,16 +130,15 @@ def point_covariance(
         tensor([[ 2.,  2., 32.],
                 [ 0.,  0.,  0.]])
     """
-    check_shapes(proj=(proj, "+V 3 4"), points=(points, "N 3"), weights=(weights, "V N"))
-    shapes = [proj.shape[:-3], points.shape[:-2], weights.shape[:-2]]
-    if mask is not None:
-        check_shapes(weights=(weights, "V N"), mask=(mask, "V N"))
-        shapes.append(mask.shape[:-2])
-    if pose_covariance is not None:
-        check_shapes(proj=(proj, "+V 3 4"), pose_covariance=(pose_covariance, "V 6 6"))
-        shapes.append(pose_covariance.shape[:-3])
+    check_tensor(weights=weights)
+    batch = check_batch(
+        proj=(proj, "+V 3 4"),
+        points=(points, "N 3"),
+        weights=(weights, "V N"),
+        mask=(mask, "V N"),
+        pose_covariance=(pose_covariance, "V 6 6"),
+    )
     check_bool(mask=mask)
-    batch = batch_shape(*shapes)
     cameras, (places, known) = cameras_of(proj), _clean_points(points)
     work = cameras.proj.dtype
     sound, noise = cameras.broken == 0, None
@@ -184,8 +179,7 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         >>> depth_variance(torch.eye(3, 4)[None], torch.diag(torch.tensor([1.0, 2.0, 9.0]))[None])
         tensor([[9.]])
     """
-    check_shapes(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
-    batch_shape(proj.shape[:-3], covariance.shape[:-3])
+    check_batch(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
     cameras, work = cameras_of(proj), solver_dtype(proj)
     finite = _fits(covariance, torch.finfo(covariance.dtype).max)
@@ -207,8 +201,7 @@ def _clean_points(points: Tensor) -> tuple[Vector3, Tensor]:
     limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
     finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
     # Double where: what is not used must pass no gradient and no NaN.
-    x, y, z = torch.where(finite.unsqueeze(-2), place, 0.0).unbind(dim=-2)
-    return (x, y, z), finite
+    return torch.where(finite.unsqueeze(-2), place, 0.0).unbind(dim=-2), finite
 
 
 def representable(covariance: Tensor, dtype: torch.dtype) -> Tensor:
@@ -243,22 +236,22 @@ def inverse_information(normal: Sequence[Tensor], enough: Tensor) -> Symmetric3:
         ordinary = enough & (trace > limit**-0.45) & (trace < limit**0.45)
         unit = torch.where(ordinary, trace, 1.0)
     # Double where: what has no inverse must pass no gradient and no NaN.
-    xx, xy, xz, yy, yz, zz = (torch.where(ordinary, entry, 0.0) / unit for entry in normal)
-    xx, xy, xz, yy, yz, zz = inverse3((xx, xy, xz, yy, yz, zz))
+    share = tuple(torch.where(ordinary, entry, 0.0) / unit for entry in normal)
+    xx, xy, xz, yy, yz, zz = inverse3(share)
     largest = limit * enough.to(unit.dtype)
     xx, yy, zz = (torch.where(ordinary, entry / unit, largest) for entry in (xx, yy, zz))
     xy, xz, yz = (torch.where(ordinary, entry / unit, 0.0) for entry in (xy, xz, yz))
     return xx, xy, xz, yy, yz, zz
 
 
-def unpacked3(entries: Symmetric3) -> Tensor:
+def unpacked3(entries: Sequence[Tensor]) -> Tensor:
     """Symmetric matrices ``(*B, N, 3, 3)`` from six ``(*B, N)``."""
     xx, xy, xz, yy, yz, zz = entries
     # Not an index: it would be copied to the device.
     return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(*xx.shape, 3, 3)
 
 
-def unscaled(entries: Symmetric3, largest: Tensor) -> Tensor:
+def unscaled(entries: Sequence[Tensor], largest: Tensor) -> Tensor:
     """Covariances ``(*B, N, 3, 3)`` from those of weights whose largest, ``(*B, N)``, was 1."""
     unit = largest[..., None, None]
     # Divided twice: the square of a small weight may be 0.
@@ -281,8 +274,8 @@ def _of_poses(
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
     view = cameras.proj.unsqueeze(-3)  # each view alone, to keep their information apart
     x, y, w = (tensor.unsqueeze(-2) for tensor in (found.x, found.y, by_depth))
-    m00, m01, m02, m11, m12, m22 = normal_matrix(normal_coefficients(view[..., :3]), x, y, w)
-    information = unpacked3((m00, m01, m02, m11, m12, m22))  # (*B, V, N, 3, 3)
+    normal = normal_matrix(normal_coefficients(view[..., :3]), x, y, w)
+    information = unpacked3(normal)  # (*B, V, N, 3, 3)
     ox, oy, oz = (
         component.unsqueeze(-2) - center.unsqueeze(-1)
         for component, center in zip(points, cameras.centers.unbind(dim=-1), strict=True)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_bool, check_shapes
 from deltas_geom.numerics.arithmetic import solver_dtype, values_at_hand
 
 NEGLIGIBLE_WEIGHT = 1e-6
@@ -113,25 +112,3 @@ def _all_count(size: Tensor, largest: Tensor) -> bool:
         and size.numel() > 0
         and bool((size / largest).amin() > NEGLIGIBLE_WEIGHT)  # inf / inf is not
     )
-
-
-def check_weights(
-    weights: Tensor | None,
-    mask: Tensor | None,
-    name: str,
-    seen: Tensor,
-    dims: str,
-    batch: torch.Size,
-) -> torch.Size:
-    """Raise unless weights and mask ``(*B, V, N)`` fit what is weighed, and the mask is bool.
-
-    Returns:
-        The batch dims to which all broadcast.
-    """
-    shapes = [batch, seen.shape[:-3]]
-    for label, tensor in (("weights", weights), ("mask", mask)):
-        if tensor is not None:
-            check_shapes(**{name: (seen, dims), label: (tensor, "V N")})
-            shapes.append(tensor.shape[:-2])
-    check_bool(mask=mask)
-    return batch_shape(*shapes)

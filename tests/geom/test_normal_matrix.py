@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom.numerics.symmetric3 import Symmetric3, inverse3, solve3
+from deltas_geom.numerics.symmetric3 import inverse3, solve3
+from deltas_geom.numerics.vectors import Symmetric3
 from deltas_geom.testing.strategies import extreme, scales, vectors
 from deltas_geom.triangulation.dlt import _by_views, normal_coefficients, normal_matrix, rows
 from deltas_geom.triangulation.uncertainty import unpacked3
