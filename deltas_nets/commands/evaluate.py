@@ -12,7 +12,7 @@ from deltas_nets.commands.flags import Flag, Prediction, usable_device
 from deltas_nets.commands.values import at_least_one
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import counted, progress, warn
+from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.dataset import DatasetScores
@@ -95,7 +95,7 @@ class Evaluate(Prediction):
         self._write(scores)
         if scores.failures:
             failed = {**scores.total.failed, **scores.failed}
-            said = f"{counted(scores.failures, 'frame or scene')} failed; the first, "
+            said = f"frames and scenes that failed: {scores.failures}; the first, "
             warn(said + ": ".join(next(iter(failed.items()))))
             sys.exit(1)
 

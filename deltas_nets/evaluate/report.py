@@ -41,14 +41,14 @@ def scenes_table(scores: DatasetScores, *, title: str) -> Table:
     """A row a scene, and one of all: frames, those that failed, and the metrics most looked at."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("scene", overflow="fold")
-    for name in ("frames", "failed", "Abs Rel", "Abs, m", "RMSE, m", "delta < 1.25", "coverage"):
+    for name in ("frames", "failed", "Abs Rel", "Abs, m", "delta\n< 1.25", "coverage"):
         table.add_column(name, justify="right")
     for name, scene in {**scores.scenes, "all": scores.total}.items():
-        shown = ("abs_rel", "abs_diff", "rmse", "delta1", "coverage")
+        shown = ("abs_rel", "abs_diff", "delta1", "coverage")
         numbers = (f"{getattr(scene.dense, key):.3f}" for key in shown)
         table.add_row(name, str(len(scene.maps)), str(len(scene.failed)), *numbers)
     for name in scores.failed:
-        table.add_row(name, "0", "all", *5 * ("",))
+        table.add_row(name, "0", "all", *4 * ("",))
     return table
 
 

@@ -1,6 +1,6 @@
 """Depth searched where surfaces are: as the capture says, or as a first look does."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -16,7 +16,7 @@ from deltas_nets.predict.look import found_depths, look
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of, reach_within, wider
 
-__all__ = ["Asked", "Completed", "Followed", "Found", "Search"]
+__all__ = ["Asked", "Completed", "Followed", "Found", "Search", "settled"]
 
 FIRST_BASELINE = 0.2
 """Metres that the network takes the way between two views for, where nothing tells the unit."""
@@ -107,24 +107,51 @@ class Followed:
             reach, sure = Reach(*ROOM), True
         else:
             reach, sure = _by_baseline(frames), False
-        for _ in range(LOOKS - 1):
-            found = look(predictor, frames, config, reach, known)
-            depths = found_depths(found)
-            piled = end_of_pile(depths, reach)
-            if sure and piled is None:
-                return Found(found, reach, None)
-            # A sensor is in metres; it is asked only now, so that rooms do not depend on it.
-            measured = depths_of_sensor(self.capture, position) if piled and metric else None
-            if measured is not None and reach_of(measured, metric=True) != reach:
-                reach, sure = reach_of(measured, metric=True), True
-            elif piled is not None:
-                reach, sure = wider(reach, piled), False
-            elif len(depths):
-                reach, sure = reach_of(depths, metric=metric), True
-            else:
-                break
-        found = look(predictor, frames, config, reach, known)
-        return Found(found, reach, end_of_pile(found_depths(found), reach))
+
+        return settled(
+            lambda reach: look(predictor, frames, config, reach, known),
+            reach,
+            sure=sure,
+            metric=metric,
+            sensor=lambda: depths_of_sensor(self.capture, position) if metric else None,
+        )
+
+
+def settled(
+    looked: Callable[[Reach], DepthMap],
+    reach: Reach,
+    *,
+    sure: bool,
+    metric: bool,
+    sensor: Callable[[], FloatArray | None] = lambda: None,
+) -> Found:
+    """Look until points do not pile up at an end of what is searched.
+
+    Args:
+        looked: the map of a search.
+        reach: the first one.
+        sure: whether that is kept if nothing piles up, or only tells where surfaces are.
+        metric: whether the unit is the metre.
+        sensor: depths in metres that tell more, if points pile up.
+    """
+    for _ in range(LOOKS - 1):
+        found = looked(reach)
+        depths = found_depths(found)
+        piled = end_of_pile(depths, reach)
+        if sure and piled is None:
+            return Found(found, reach, None)
+        # A sensor is asked only now, so that rooms do not depend on it.
+        measured = sensor() if piled else None
+        if measured is not None and reach_of(measured, metric=True) != reach:
+            reach, sure = reach_of(measured, metric=True), True
+        elif piled is not None:
+            reach, sure = wider(reach, piled), False
+        elif len(depths):
+            reach, sure = reach_of(depths, metric=metric), True
+        else:
+            break
+    found = looked(reach)
+    return Found(found, reach, end_of_pile(found_depths(found), reach))
 
 
 class Completed:

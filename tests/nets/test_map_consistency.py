@@ -1,0 +1,99 @@
+"""Maps of one scene that agree, and maps that do not."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deltas_geom import PosedViews
+from deltas_nets.captures.frame import Frame, Lens
+from deltas_nets.captures.posed_images import PosedImages
+from deltas_nets.evaluate.consistency import SeenMaps, agreeing_share, same_places, shrunk
+from deltas_nets.rooms import render_room
+
+WALL = 2.0
+SIZE = (24, 32)
+
+
+@pytest.fixture(scope="module")
+def room() -> PosedImages:
+    return render_room(0, num_views=4, image_size=(96, 128))
+
+
+def frame(room: PosedImages, id: int) -> Frame:
+    K, pose = (part[id].double().numpy() for part in room.views)
+    return Frame(str(id), None, (96, 128), K, pose)  # type: ignore[arg-type]
+
+
+def seen(room: PosedImages, scales: list[float], lens: Lens | None = None) -> SeenMaps:
+    """The maps of a room, each its true depth at some scale."""
+    maps = SeenMaps()
+    for id, scale in enumerate(scales):
+        truth = room.depth[id].numpy()
+        given = frame(room, id)
+        object.__setattr__(given, "lens", lens)
+        maps.add(given, np.float32(scale) * truth, truth)
+    return maps
+
+
+def camera(x: float) -> PosedViews:
+    K = torch.tensor([[[32.0, 0, 15.5], [0, 32, 11.5], [0, 0, 1]]]).double()
+    pose = torch.eye(4).double()[None].clone()
+    pose[0, 0, 3] = -x
+    return PosedViews(K, pose)
+
+
+@given(scale=st.floats(0.8, 1.25))
+@settings(max_examples=30)
+def test_walls_agree_as_far_as_their_depths_do(scale: float) -> None:
+    wall = np.full(SIZE, WALL, np.float32)
+    share = agreeing_share(camera(0), wall, camera(0.25), np.float32(scale) * wall)
+    assert share == (1.0 if abs(scale - 1) < 0.05 else 0.0) or abs(abs(scale - 1) - 0.05) < 1e-4
+
+
+def test_what_the_other_has_no_depth_for_does_not_count() -> None:
+    wall = np.full(SIZE, WALL, np.float32)
+    half = wall.copy()
+    half[:, 16:] = 0
+    half[:, :8] = 3
+    # The other stands 0.25 m to the right: the wall is 4 pixels farther left there, so of the first
+    # 16 columns 8 show something else and 8 the wall.
+    assert agreeing_share(camera(0), wall, camera(0.25), half) == pytest.approx(8 / 16)
+    assert np.isnan(agreeing_share(camera(0), wall, camera(0.25), 0 * wall))
+
+
+def test_places_are_found_where_parallax_puts_them() -> None:
+    wall = np.full(SIZE, WALL, np.float32)
+    here, there = same_places(camera(0), wall, camera(0.25), wall)
+    rows, columns = np.divmod(here, SIZE[1])
+    assert np.array_equal(there, rows * SIZE[1] + columns - 4)
+    assert columns.min() == 4
+    assert len(here) == SIZE[0] * (SIZE[1] - 4)
+
+
+def test_true_maps_agree_as_the_truth_does_and_do_not_flicker(room: PosedImages) -> None:
+    found = seen(room, [1, 1, 1, 1]).result()
+    assert found.agreement == found.truth > 0.5
+    assert found.flicker == 0
+    assert found.pairs > 0
+    assert found.successive == 3
+
+
+def test_a_common_scale_flickers_not_and_changing_ones_do(room: PosedImages) -> None:
+    assert seen(room, [1.1] * 4).result().flicker == pytest.approx(0, abs=1e-6)
+    found = seen(room, [1, 1.2, 1, 1.2]).result()
+    assert found.flicker == pytest.approx(np.log(1.2), abs=1e-6)
+    assert found.agreement < 0.8 * found.truth
+
+
+def test_one_map_and_bent_lines_say_nothing(room: PosedImages) -> None:
+    for maps in (seen(room, [1]), seen(room, [1, 1, 1], Lens("SIMPLE_RADIAL", (0.1,)))):
+        found = maps.result()
+        assert np.isnan([found.agreement, found.truth, found.flicker]).all()
+        assert found.pairs == found.successive == 0
+
+
+def test_shrinking_keeps_values_and_places() -> None:
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)
+    assert np.array_equal(shrunk(image.repeat(6, 0).repeat(6, 1), (3, 4)), image)
