@@ -120,17 +120,20 @@ def sights(
         noise: px.
         outliers: one view of each point is wrong by 50 px or more, across the rows: cameras side
             by side have these for epipolar lines within 0.7 rad, so that no other view can agree.
+            Which they are is an input more, ``(V, N)``.
     """
     scene = draw(posed_scenes(num_views=num_views))
     off = draw(vectors(num_views * 4, within=noise, size=2)).reshape(num_views, 4, 2)
+    which: Inputs = {}
     if outliers:
         wrong = torch.tensor(draw(st.lists(st.integers(0, num_views - 1), min_size=4, max_size=4)))
         up = 2.0 * torch.tensor(draw(st.lists(st.booleans(), min_size=4, max_size=4))) - 1
         aside = torch.stack([draw(vectors(1, within=20.0, size=4))[0], 50 * up], dim=-1)
-        off = off + aside * (torch.arange(num_views)[:, None] == wrong)[..., None]
+        which = {"outliers": torch.arange(num_views)[:, None] == wrong}
+        off = off + aside * which["outliers"][..., None]
     weights = 0.75 + draw(vectors(num_views, within=0.25, size=4))
     found = inputs_of(scene._replace(pixels=scene.pixels + off), weights)
-    return found | {"points": scene.points + draw(vectors(4, within=0.05))}
+    return found | which | {"points": scene.points + draw(vectors(4, within=0.05))}
 
 
 def of_views(values: dict[str, Tensor], views: list[int]) -> dict[str, Tensor]:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
+from triangulation_cases import rays_to, surrounded
 
 import deltas_geom as geom
 from deltas_geom import Status
@@ -20,21 +21,9 @@ FOCAL = 1e6  # px, of images so narrow that a pixel is an angle
 
 
 @st.composite
-def sights(draw: st.DrawFn, num_views: int = 4) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cameras turned any way, noisy rays to points on all sides, these, and weights of 0.5 to 1."""
-    turn, shift = draw(vectors(num_views, within=3.0)), draw(vectors(num_views, within=0.1))
-    corners = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]]).double()
-    poses = geom.invert_pose(rigid(turn, corners[:num_views] + shift))
-    sides = torch.tensor([[1.0, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, -1], [-1, 1, -1]]).double()
-    points = 2.5 * sides + draw(vectors(5, within=0.5))
-    rays = rays_to(poses, points)
-    off = draw(vectors(5 * num_views, within=2e-3)).reshape(num_views, 5, 3)
-    weights = 0.75 + draw(vectors(num_views, within=0.25, size=5))
-    return poses, rays / rays.norm(dim=-1, keepdim=True) + off, points, weights
-
-
-def rays_to(poses: Tensor, points: Tensor) -> Tensor:
-    return geom.to_homogeneous(points) @ poses[..., :3, :].mT
+def sights(draw: st.DrawFn) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Four cameras, noisy rays to points on all sides, these, and weights of 0.5 to 1."""
+    return *draw(surrounded(num_views=4)), 0.75 + draw(vectors(4, within=0.25, size=5))
 
 
 def angles(poses: Tensor, rays: Tensor, points: Tensor) -> Tensor:

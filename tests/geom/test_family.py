@@ -2,81 +2,53 @@
 
 import inspect
 import re
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from operations import tensors_of
+from operations import Inputs, tensors_of
+from solvers import inputs_of, sights
 from torch import Tensor
 from torch.testing import assert_close
 
 import deltas_geom as geom
 from deltas_geom import Status
 from deltas_geom.testing import PosedScene
-from deltas_geom.testing.strategies import posed_scenes, vectors
+from deltas_geom.testing.fixed_scenes import seeded_scene
 
-NOISE = 0.5  # px
 FOCAL = 300.0
 
 
-class Sights(NamedTuple):
-    """Noisy pixels of points, their rays and their weights."""
-
-    poses: Tensor
-    proj: Tensor
-    pixels: Tensor
-    rays: Tensor
-    weights: Tensor
-
-
-def seen(scene: PosedScene, weights: Tensor) -> Sights:
-    rays = geom.pixel_rays(scene.views.K, scene.pixels)
-    return Sights(scene.views.cam_from_world, scene.views.proj, scene.pixels, rays, weights)
-
-
-@st.composite
-def sights(draw: st.DrawFn, num_views: int = 4) -> Sights:
-    """Views of four points with noise, and weights of 0.2 to 1."""
-    scene: PosedScene = draw(posed_scenes(num_views=num_views))
-    noise = draw(vectors(num_views, within=NOISE, size=8)).reshape(num_views, 4, 2)
-    weights = 0.6 + draw(vectors(num_views, within=0.4, size=4))
-    return seen(scene._replace(pixels=scene.pixels + noise), weights)
-
-
-def by_tracks(s: Sights, **options: Any) -> Any:
-    views, num = s.weights.shape
+def by_tracks(s: Inputs, **options: Any) -> Any:
+    """As a list, view by view."""
+    views, num = s["weights"].shape
     camera = torch.arange(views).repeat_interleave(num)
     point = torch.arange(num).repeat(views)
     return geom.triangulate_tracks(
-        s.proj, s.pixels.reshape(-1, 2), camera, point, num, s.weights.flatten(), **options
+        s["proj"], s["pixels"].reshape(-1, 2), camera, point, num, s["weights"].flatten(), **options
     )
 
 
-SOLVERS: dict[str, Callable[..., Any]] = {
-    "triangulate": lambda s, **options: geom.triangulate(s.proj, s.pixels, s.weights, **options),
-    "triangulate_rays": lambda s, **options: geom.triangulate_rays(
-        s.poses, s.rays, s.weights, **options
-    ),
-    "triangulate_midpoint": lambda s, **options: geom.triangulate_midpoint(
-        s.poses, s.rays, s.weights, **options
-    ),
-    "triangulate_inverse_depth_weighted": lambda s, **options: (
-        geom.triangulate_inverse_depth_weighted(s.poses, s.rays, s.weights, **options)
-    ),
-    "triangulate_tracks": by_tracks,
-    "triangulate_two_view": lambda s, **options: geom.triangulate_two_view(
-        s.proj[:2], s.pixels[:2], **options
-    ),
-}
+def solved(name: str, s: Inputs, **options: Any) -> Any:
+    """By the function of this name."""
+    if name == "triangulate_tracks":
+        return by_tracks(s, **options)
+    if name == "triangulate_two_view":
+        return geom.triangulate_two_view(s["proj"][:2], s["pixels"][:2], **options)
+    seen = (s["poses"], s["rays"]) if name in OF_ANGLES else (s["proj"], s["pixels"])
+    return getattr(geom, name)(*seen, s["weights"], **options)
+
+
+OF_ANGLES = ["triangulate_rays", "triangulate_midpoint", "triangulate_inverse_depth_weighted"]
+SOLVERS = ["triangulate", *OF_ANGLES, "triangulate_tracks", "triangulate_two_view"]
 EACH = pytest.mark.parametrize("name", SOLVERS)
-OF_RAYS = pytest.mark.parametrize("name", [name for name in list(SOLVERS)[1:4]])
+OF_RAYS = pytest.mark.parametrize("name", OF_ANGLES)
 
 
-def weights_of(name: str, s: Sights) -> Tensor:
-    return torch.ones(2, 4).double() if name == "triangulate_two_view" else s.weights
+def weights_of(name: str, s: Inputs) -> Tensor:
+    return torch.ones(2, 4).double() if name == "triangulate_two_view" else s["weights"]
 
 
 def by_view(field: Tensor) -> Tensor:
@@ -84,45 +56,45 @@ def by_view(field: Tensor) -> Tensor:
     return field.reshape(-1, 4) if field.ndim == 1 else field
 
 
-def angles(s: Sights, points: Tensor) -> Tensor:
+def angles(s: Inputs, points: Tensor) -> Tensor:
     """Between rays and the directions to points, rad."""
-    to_points = geom.to_homogeneous(points) @ s.poses[:, :3].mT
-    across = torch.linalg.cross(s.rays, to_points).norm(dim=-1)
-    return torch.atan2(across, (s.rays * to_points).sum(dim=-1))
+    to_points = geom.to_homogeneous(points) @ s["poses"][:, :3].mT
+    across = torch.linalg.cross(s["rays"], to_points).norm(dim=-1)
+    return torch.atan2(across, (s["rays"] * to_points).sum(dim=-1))
 
 
 @EACH
-@given(s=sights())
-def test_the_residual_is_the_weighted_mean_of_the_errors(name: str, s: Sights) -> None:
-    found = SOLVERS[name](s)
+@given(s=sights(4))
+def test_the_residual_is_the_weighted_mean_of_the_errors(name: str, s: Inputs) -> None:
+    found = solved(name, s)
     weights, errors = weights_of(name, s), by_view(found.errors)
     mean = ((weights * errors).square().sum(dim=0) / weights.square().sum(dim=0)).sqrt()
     assert_close(found.residual, mean, rtol=1e-9, atol=1e-12)
 
 
 @OF_RAYS
-@given(s=sights())
-def test_errors_of_rays_are_angles(name: str, s: Sights) -> None:
-    found = SOLVERS[name](s)
+@given(s=sights(4))
+def test_errors_of_rays_are_angles(name: str, s: Inputs) -> None:
+    found = solved(name, s)
     assert_close(found.errors, angles(s, found.points), rtol=0, atol=1e-12)  # rad
 
 
-@given(s=sights(num_views=2))
-def test_errors_of_two_views_are_distances_of_the_projections(s: Sights) -> None:
-    found = SOLVERS["triangulate_two_view"](s)
-    wanted = (found.pixels - s.pixels).norm(dim=-1)
+@given(s=sights(2))
+def test_errors_of_two_views_are_distances_of_the_projections(s: Inputs) -> None:
+    found = solved("triangulate_two_view", s)
+    wanted = (found.pixels - s["pixels"]).norm(dim=-1)
     assert_close(found.errors, wanted, rtol=0, atol=1e-9)  # px
 
 
-@given(s=sights(num_views=5), used=st.lists(st.booleans(), min_size=20, max_size=20))
-def test_tracks_know_what_the_dense_function_knows(s: Sights, used: list[bool]) -> None:
-    s = s._replace(weights=s.weights * torch.tensor(used).reshape(5, 4))
-    found, wanted = by_tracks(s, covariance=True), SOLVERS["triangulate"](s, covariance=True)
+@given(s=sights(5), used=st.lists(st.booleans(), min_size=20, max_size=20))
+def test_tracks_know_what_the_dense_function_knows(s: Inputs, used: list[bool]) -> None:
+    s = s | {"weights": s["weights"] * torch.tensor(used).reshape(5, 4)}
+    found, wanted = by_tracks(s, covariance=True), solved("triangulate", s, covariance=True)
     assert_close(by_view(found.errors), wanted.errors, rtol=0, atol=1e-9)  # px
-    assert torch.equal(by_view(found.used), s.weights > 0)
+    assert torch.equal(by_view(found.used), s["weights"] > 0)
     size = float(wanted.covariance.abs().max())
     assert_close(found.covariance, wanted.covariance, rtol=0, atol=1e-9 * (1e-9 + size))
-    few = (s.weights > 0).sum(dim=0) <= 3
+    few = (s["weights"] > 0).sum(dim=0) <= 3
     assert_close(found.parallax[few], wanted.parallax[few], rtol=0, atol=1e-9)  # rad
     assert (found.parallax <= wanted.parallax + 1e-9).all()
     assert (found.parallax >= 0.5 * wanted.parallax - 1e-9).all()
@@ -143,29 +115,29 @@ def test_the_parallax_of_long_tracks_is_nearly_the_largest() -> None:
     assert (share > 1 - 1e-9).double().mean() > 0.6
 
 
-@given(s=sights(num_views=2))
-def test_the_covariance_of_two_views_is_that_of_their_points(s: Sights) -> None:
-    found = SOLVERS["triangulate_two_view"](s, covariance=True)
-    wanted = geom.point_covariance(s.proj, found.points, torch.ones(2, 4).double())
+@given(s=sights(2))
+def test_the_covariance_of_two_views_is_that_of_their_points(s: Inputs) -> None:
+    found = solved("triangulate_two_view", s, covariance=True)
+    wanted = geom.point_covariance(s["proj"], found.points, torch.ones(2, 4).double())
     assert_close(found.covariance, wanted, rtol=1e-9, atol=0)
 
 
 @OF_RAYS
-@given(s=sights())
-def test_the_covariance_of_rays_is_what_their_angles_allow(name: str, s: Sights) -> None:
-    found = SOLVERS[name](s, covariance=True)
+@given(s=sights(4))
+def test_the_covariance_of_rays_is_what_their_angles_allow(name: str, s: Inputs) -> None:
+    found = solved(name, s, covariance=True)
     # Half the second derivative of the squares of the angles, at rays without error.
-    exact = geom.to_homogeneous(found.points) @ s.poses[:, :3].mT
+    exact = geom.to_homogeneous(found.points) @ s["poses"][:, :3].mT
     for n in range(4):
 
         def cost(point: Tensor, n: int = n) -> Tensor:
             sines = torch.linalg.cross(
                 torch.nn.functional.normalize(exact[:, n], dim=-1),
                 torch.nn.functional.normalize(
-                    geom.to_homogeneous(point) @ s.poses[:, :3].mT, dim=-1
+                    geom.to_homogeneous(point) @ s["poses"][:, :3].mT, dim=-1
                 ),
             )
-            return (s.weights[:, n, None] * sines).square().sum() / 2
+            return (s["weights"][:, n, None] * sines).square().sum() / 2
 
         information = torch.autograd.functional.hessian(cost, found.points[n])
         wanted = torch.linalg.inv(information)
@@ -190,13 +162,13 @@ def test_the_covariance_of_rays_is_what_monte_carlo_finds() -> None:
 
 
 @EACH
-@given(s=sights(), share=st.floats(0.3, 1.5))
+@given(s=sights(4), share=st.floats(0.3, 1.5))
 def test_max_residual_refuses_points_that_the_views_disagree_about(
-    name: str, s: Sights, share: float
+    name: str, s: Inputs, share: float
 ) -> None:
-    free = SOLVERS[name](s, covariance=True)
+    free = solved(name, s, covariance=True)
     limit = max(share * float(free.residual.median()), 1e-12)
-    found = SOLVERS[name](s, covariance=True, max_residual=limit)
+    found = solved(name, s, covariance=True, max_residual=limit)
     large = free.residual > limit
     assert torch.equal(found.status == Status.RESIDUAL_TOO_LARGE, large)
     assert torch.equal(found.errors, free.errors)
@@ -208,11 +180,11 @@ def test_max_residual_refuses_points_that_the_views_disagree_about(
 
 
 @EACH
-@given(s=sights(), far=st.floats(1.9, 6.0))
+@given(s=sights(4), far=st.floats(1.9, 6.0))
 def test_within_depth_refuses_points_that_some_view_has_outside(
-    name: str, s: Sights, far: float
+    name: str, s: Inputs, far: float
 ) -> None:
-    free = SOLVERS[name](s, covariance=True)
+    free = solved(name, s, covariance=True)
     every = isinstance(free, (geom.TriangulatedTracks, geom.TwoViewTriangulation))
     found = free.within_depth((0.5, far))
     depth = by_view(free.depth)
@@ -245,11 +217,15 @@ def test_a_refused_point_has_no_gradient_and_the_others_keep_theirs(name: str) -
     pixels = pixels + 0.1 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     pixels[0, 1, 1] += 30
     pixels.requires_grad_()
-    s = Sights(
-        poses, K @ poses[:, :3], pixels, geom.pixel_rays(K, pixels), torch.ones(4, 4).double()
-    )
-    of_rays = "rays" in name or "midpoint" in name or "inverse" in name
-    found = SOLVERS[name](s, max_residual=4 / FOCAL if of_rays else 4.0)
+    s = inputs_of(PosedScene(geom.PosedViews(K, poses), points, pixels))
+    of_rays = name in OF_ANGLES
+    found = solved(name, s, max_residual=4 / FOCAL if of_rays else 4.0)
+    near = solved(name, s).within_depth((0.5, 3.6))
+    assert near.valid[[0, 2, 3]].tolist() == [True, False, False]
+    reached = near.points.sum() + near.depth.sum()
+    (gradient,) = torch.autograd.grad(reached, pixels, retain_graph=True)
+    assert gradient.isfinite().all() and (gradient[:, 2:] == 0).all()
+    assert (gradient[:2, 0] != 0).any()
     assert found.valid.tolist() == [True, False, True, True]
     assert by_view(found.errors)[:2, 1].max() > (4 / FOCAL if of_rays else 4.0)
     total = found.points.sum() + found.depth.sum() + found.residual.sum()
@@ -262,10 +238,9 @@ def test_a_refused_point_has_no_gradient_and_the_others_keep_theirs(name: str) -
 
 @EACH
 def test_a_limit_is_positive(name: str) -> None:
-    poses = torch.eye(4).repeat(4, 1, 1)
-    s = Sights(poses, poses[:, :3], torch.ones(4, 4, 2), torch.ones(4, 4, 3), torch.ones(4, 4))
+    s = inputs_of(seeded_scene(0, num_views=4, num_points=4))
     with pytest.raises(ValueError, match="max_residual must be positive, got 0"):
-        SOLVERS[name](s, max_residual=0.0)
+        solved(name, s, max_residual=0.0)
 
 
 def test_every_function_of_views_says_how_points_before_views_are_noticed() -> None:
@@ -296,9 +271,8 @@ def test_points_before_views_have_large_residuals(name: str) -> None:
     points[:, 2] += 4
     pixels = geom.project(geom.PosedViews(K, poses), points).pixels
     wrong = pixels.transpose(0, 1).contiguous()
-    ones = torch.ones(num, num).double()
     limit = 4.0 if name in ("triangulate", "triangulate_two_view") else 4 / FOCAL
     for seen, fits in ((pixels, True), (wrong, False)):
-        s = Sights(poses, K @ poses[:, :3], seen, geom.pixel_rays(K, seen), ones)
-        found = SOLVERS[name](s, max_residual=limit)
+        s = inputs_of(PosedScene(geom.PosedViews(K, poses), points, seen))
+        found = solved(name, s, max_residual=limit)
         assert found.valid.all() if fits else not found.valid.any()

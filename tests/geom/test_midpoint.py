@@ -7,41 +7,22 @@ import pytest
 import scipy.optimize
 import torch
 from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
+from triangulation_cases import rays_to, surrounded
 
 from deltas_geom import (
     Status,
     Triangulation,
     camera_centers,
-    invert_pose,
-    to_homogeneous,
     triangulate_inverse_depth_weighted,
     triangulate_midpoint,
     triangulate_rays,
 )
 from deltas_geom.testing import rigid
-from deltas_geom.testing.strategies import vectors
 
 Solver = Callable[..., Triangulation]
 SOLVERS = [triangulate_midpoint, triangulate_inverse_depth_weighted]
 both = pytest.mark.parametrize("solve", SOLVERS, ids=["midpoint", "inverse_depth"])
-NOISE = 2e-3  # rad
-
-
-@st.composite
-def sights(
-    draw: st.DrawFn, num_views: int = 3, noise: float = NOISE
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Cameras turned any way, 0.5 m apart; noisy rays to points 2 m or more away; the points."""
-    turn, shift = draw(vectors(num_views, within=3.0)), draw(vectors(num_views, within=0.1))
-    corners = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]]).double()
-    cam_from_world = invert_pose(rigid(turn, corners[:num_views] + shift))
-    sides = torch.tensor([[1.0, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, -1], [-1, 1, -1]]).double()
-    points = 2.5 * sides + draw(vectors(5, within=0.5))
-    rays = to_homogeneous(points) @ cam_from_world[..., :3, :].mT
-    off = draw(vectors(5 * num_views, within=noise)).reshape(num_views, 5, 3)
-    return cam_from_world, rays / rays.norm(dim=-1, keepdim=True) + off, points
 
 
 def lines(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -75,7 +56,7 @@ def arc(
     away = torch.linspace(4, nearest, num_views).double()
     cam_from_world = rigid(turn, away[:, None] * torch.tensor([0.0, 0, 1]))
     points = torch.rand(4000, 3, generator=generator, dtype=torch.float64) - 0.5
-    rays = to_homogeneous(points) @ cam_from_world[:, :3, :].mT
+    rays = rays_to(cam_from_world, points)
     rays = rays / rays.norm(dim=-1, keepdim=True)
     off = noise * torch.randn(rays.shape, generator=generator, dtype=torch.float64)
     return cam_from_world, rays + off, points
@@ -86,7 +67,7 @@ def median_error(result: Triangulation, points: Tensor) -> float:
     return float((result.points - points).norm(dim=-1)[result.valid].median())
 
 
-@given(drawn=sights())
+@given(drawn=surrounded())
 def test_no_point_is_nearer_to_the_lines_than_the_midpoint(drawn: tuple[Tensor, ...]) -> None:
     cam_from_world, rays, _ = drawn
     weights = torch.linspace(0.5, 1.5, 15).double().reshape(3, 5)
@@ -204,7 +185,7 @@ def test_what_is_far_in_float32_is_far_for_dlt_too(
     cam_from_world, _, points = arc(30.0)  # 2 m apart
     cam_from_world[1, :3, :3] = torch.eye(3)
     far = points[:50] + torch.tensor([0, 0, distance])
-    rays = to_homogeneous(far) @ cam_from_world[:, :3, :].mT
+    rays = rays_to(cam_from_world, far)
     wanted = triangulate_rays(cam_from_world.double(), rays.double())
     assert wanted.valid.all()
     rays = rays / distance

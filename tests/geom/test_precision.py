@@ -60,6 +60,10 @@ def test_what_is_mixed_is_promoted() -> None:
     assert geom.project(views, points).pixels.dtype == torch.float64
     single = geom.PosedViews(K, poses)
     assert geom.project(single, points.double()).depth.dtype == torch.float64
+    pixels = geom.project(single, points).pixels.half().requires_grad_()
+    found = geom.triangulate_points(single.proj, pixels)
+    assert torch.equal(found, geom.triangulate_points(single.proj, pixels.float()))
+    assert torch.autograd.grad(found.sum(), pixels)[0].dtype == torch.float16
 
 
 def there_and_back(K: Tensor, cam_from_world: Tensor, points: Tensor) -> Tensor:

@@ -6,6 +6,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from operations import Inputs
+from solvers import sights
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -18,38 +20,11 @@ from deltas_geom import (
 )
 from deltas_geom.testing import PosedScene, ring, scene_from
 from deltas_geom.testing.fixed_scenes import seeded_scene
-from deltas_geom.testing.strategies import posed_scenes, vectors
-
-NOISE = 0.5  # px, so that all views are within the default threshold of 4 px
 
 
-@st.composite
-def noisy(draw: st.DrawFn, num_views: int = 5) -> tuple[PosedScene, Tensor]:
-    """A scene of four points whose pixels are off by up to NOISE, and weights of 0.5 to 1."""
-    scene = draw(posed_scenes(num_views=num_views))
-    noise = draw(vectors(num_views * 4, within=NOISE, size=2)).reshape(num_views, 4, 2)
-    weights = 0.75 + draw(vectors(num_views, within=0.25, size=4))
-    return scene._replace(pixels=scene.pixels + noise), weights
-
-
-@st.composite
-def spoiled(draw: st.DrawFn, num_views: int = 5) -> tuple[PosedScene, Tensor, Tensor]:
-    """The same, and one view of each point 50 px or more from where it belongs: the outliers.
-
-    Across the rows, which the cameras side by side have for epipolar lines within 0.7 rad: no
-    other view can agree.
-    """
-    scene, weights = draw(noisy(num_views))
-    wrong = torch.tensor(draw(st.lists(st.integers(0, num_views - 1), min_size=4, max_size=4)))
-    outliers = torch.arange(num_views)[:, None] == wrong
-    up = 2.0 * torch.tensor(draw(st.lists(st.booleans(), min_size=4, max_size=4))) - 1
-    offset = torch.stack([draw(vectors(1, within=20.0, size=4))[0], 50 + 0 * up], dim=-1)
-    moved = scene.pixels + offset * up[:, None]
-    return (
-        scene._replace(pixels=torch.where(outliers[..., None], moved, scene.pixels)),
-        weights,
-        outliers,
-    )
+def seen(inputs: Inputs) -> tuple[Tensor, Tensor, Tensor]:
+    """Cameras, pixels and weights; noise is within the default threshold of 4 px."""
+    return inputs["proj"], inputs["pixels"], inputs["weights"]
 
 
 def assert_same(found: RobustTriangulation, wanted: Any, *, atol: float = 1e-9) -> None:
@@ -72,9 +47,9 @@ def test_wrong_arguments_are_named() -> None:
 @pytest.mark.parametrize("num_views", [2, 3, 5])
 @given(data=st.data())
 def test_without_outliers_it_is_triangulation(num_views: int, data: st.DataObject) -> None:
-    scene, weights = data.draw(noisy(num_views))
-    found = triangulate_robust(scene.views.proj, scene.pixels, weights, covariance=True)
-    wanted = triangulate(scene.views.proj, scene.pixels, weights, covariance=True)
+    inputs = seen(data.draw(sights(num_views)))
+    found = triangulate_robust(*inputs, covariance=True)
+    wanted = triangulate(*inputs, covariance=True)
     assert found.inliers.all()
     for ours, plain in zip(found, wanted, strict=False):
         assert torch.equal(ours, plain)
@@ -83,21 +58,22 @@ def test_without_outliers_it_is_triangulation(num_views: int, data: st.DataObjec
 @pytest.mark.parametrize("num_views", [4, 5, 8])
 @given(data=st.data())
 def test_one_gross_outlier_is_found(num_views: int, data: st.DataObject) -> None:
-    scene, weights, outliers = data.draw(spoiled(num_views))
-    found = triangulate_robust(scene.views.proj, scene.pixels, weights)
-    assert torch.equal(found.inliers, ~outliers)
-    assert_same(found, triangulate(scene.views.proj, scene.pixels, weights, ~outliers), atol=0)
+    drawn = data.draw(sights(num_views, outliers=True))
+    found = triangulate_robust(*seen(drawn))
+    assert torch.equal(found.inliers, ~drawn["outliers"])
+    assert_same(found, triangulate(*seen(drawn), ~drawn["outliers"]), atol=0)
 
 
-@given(drawn=spoiled(), view=st.integers(0, 4), value=st.sampled_from([torch.nan, torch.inf]))
-def test_a_view_that_is_not_finite_is_an_outlier(
-    drawn: tuple[PosedScene, Tensor, Tensor], view: int, value: float
-) -> None:
-    scene, weights, _ = drawn
+@given(
+    drawn=sights(5, outliers=True),
+    view=st.integers(0, 4),
+    value=st.sampled_from([torch.nan, torch.inf]),
+)
+def test_a_view_that_is_not_finite_is_an_outlier(drawn: Inputs, view: int, value: float) -> None:
     there = (torch.arange(5) != view)[:, None].expand(5, 4)
-    wanted = triangulate_robust(scene.views.proj, scene.pixels, weights, there)
+    wanted = triangulate_robust(*seen(drawn), there)
     for spoilt in range(3):
-        inputs = [tensor.clone() for tensor in (scene.views.proj, scene.pixels, weights)]
+        inputs = [tensor.clone() for tensor in seen(drawn)]
         inputs[spoilt][view] = value
         found = triangulate_robust(*inputs)
         assert torch.equal(found.inliers, wanted.inliers)
@@ -188,18 +164,16 @@ def test_a_wild_view_spoils_no_other(size: float) -> None:
         assert all(gradient.isfinite().all() for gradient in gradients)
 
 
-@given(drawn=noisy(2), off=st.floats(10, 30))
-def test_a_threshold_is_a_distance_in_pixels(drawn: tuple[PosedScene, Tensor], off: float) -> None:
-    scene, _ = drawn
-    scene.pixels[1, :, 1] += off
-    best = triangulate(scene.views.proj, scene.pixels)
-    distance = (scene_from(scene.views, best.points).pixels - scene.pixels).norm(dim=-1).amax(dim=0)
+@given(drawn=sights(2), off=st.floats(10, 30))
+def test_a_threshold_is_a_distance_in_pixels(drawn: Inputs, off: float) -> None:
+    drawn["pixels"][1, :, 1] += off
+    distance = triangulate(drawn["proj"], drawn["pixels"]).errors.amax(dim=0)
     assert (distance > 2).all()  # px: epipolar lines within 0.7 rad of the rows
     for point in range(4):
-        some = scene.pixels[:, point : point + 1]
+        some = drawn["pixels"][:, point : point + 1]
         for factor in (0.5, 1.001):
             found = triangulate_robust(
-                scene.views.proj, some, threshold=factor * float(distance[point])
+                drawn["proj"], some, threshold=factor * float(distance[point])
             )
             assert found.valid.item() == (factor > 1)
 
@@ -262,12 +236,11 @@ def test_many_views_are_judged_by_some_pairs(num_views: int) -> None:
     assert_close(found.points, scene.points, rtol=0, atol=1e-9)  # m
 
 
-@given(drawn=spoiled())
-def test_gradients_are_those_of_the_inliers(drawn: tuple[PosedScene, Tensor, Tensor]) -> None:
-    scene, weights, outliers = drawn
-    pixels = scene.pixels.clone()
-    pixels[:, 3] = 1e4 * torch.arange(10).reshape(5, 2)  # none agree
-    inputs = [value.clone().requires_grad_() for value in (scene.views.proj, pixels, weights)]
+@given(drawn=sights(5, outliers=True))
+def test_gradients_are_those_of_the_inliers(drawn: Inputs) -> None:
+    outliers = drawn["outliers"]
+    drawn["pixels"][:, 3] = 1e4 * torch.arange(10).reshape(5, 2)  # none agree
+    inputs = [value.clone().requires_grad_() for value in seen(drawn)]
     found = triangulate_robust(*inputs)
     wanted = triangulate(*inputs, found.inliers)
     assert found.valid.tolist() == [True, True, True, False]
