@@ -12,6 +12,7 @@ from deltas_nets.commands.convert import Convert
 from deltas_nets.commands.cost import Cost
 from deltas_nets.commands.demo import Demo
 from deltas_nets.commands.depth import Depth
+from deltas_nets.commands.detectors import Detectors
 from deltas_nets.commands.distill import Distill
 from deltas_nets.commands.evaluate import Evaluate
 from deltas_nets.commands.export import Export
@@ -30,6 +31,7 @@ COMMANDS = (
     Check,
     Convert,
     Evaluate,
+    Detectors,
     Train,
     Recipe,
     Distill,

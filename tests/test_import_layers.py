@@ -18,7 +18,7 @@ ABOVE = {
     ),
     "deltas_nets": (
         "errors terminal config captures network check outputs weights_file losses reference rooms "
-        "datasets cost fuse agree predict evaluate page view distill teachers export train "
+        "datasets cost fuse agree predict distill evaluate page view teachers export train "
         "commands cli"
     ),
 }

@@ -10,7 +10,7 @@ from typing import Any
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
-__all__ = ["at_least_one", "check_values", "read_shard"]
+__all__ = ["at_least_one", "check_values", "not_negative", "positive", "read_shard"]
 
 LEAST_SIDE = 32  # px
 
@@ -68,6 +68,26 @@ def at_least_one(value: int, flag: str) -> None:
     """
     if value < 1:
         raise UserError("too few", f"{flag} {value}", "use 1 or more")
+
+
+def not_negative(value: float, flag: str) -> None:
+    """A distance or a seed.
+
+    Raises:
+        UserError: it is below 0.
+    """
+    if value < 0:
+        raise UserError("too small", f"{flag} {value:g}", "use 0 or more")
+
+
+def positive(value: float, flag: str) -> None:
+    """A length, or anything that must be more than nothing.
+
+    Raises:
+        UserError: it is 0 or less, or infinite.
+    """
+    if not 0 < value < math.inf:
+        raise UserError("too small or infinite", f"{flag} {value:g}", "give a positive number")
 
 
 def _passes(value: int, flag: str) -> None:

@@ -61,7 +61,7 @@ class Repeatability(NamedTuple):
         return self.paired / self.fewer if self.fewer else float("nan")
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
     """Points of one view in the other.
 
     Attributes:
@@ -97,8 +97,8 @@ def repeatability(
         ShapeError: a trailing shape differs.
     """
     check_shapes(depth=(depth, "2 H W"), first=(first, "N 2"), second=(second, "M 2"))
-    forth = _seen_by_other(views, depth, first, depth_tolerance)
-    back = _seen_by_other(views.select([1, 0]), depth.flip(0), second, depth_tolerance)
+    forth = seen_by_other(views, depth, first, depth_tolerance)
+    back = seen_by_other(views.select([1, 0]), depth.flip(0), second, depth_tolerance)
     in_second = _distances(forth.pixels[forth.counts], second[back.counts])
     in_first = _distances(back.pixels[back.counts], first[forth.counts])
     nearest = torch.cat([_nearest(in_second), _nearest(in_first)])
@@ -153,9 +153,7 @@ def strongest_points(
     return torch.stack([index % width, row], dim=-1).to(scores.dtype)
 
 
-def _seen_by_other(
-    views: PosedViews, depth: Tensor, pixels: Tensor, depth_tolerance: float
-) -> _Seen:
+def seen_by_other(views: PosedViews, depth: Tensor, pixels: Tensor, depth_tolerance: float) -> Seen:
     """Where view 1 sees points of view 0, and whether it does."""
     size = (depth.shape[-2], depth.shape[-1])
     own = torch.where(in_image(pixels, image_size=size), read_nearest(depth[0], pixels), 0.0)
@@ -166,7 +164,7 @@ def _seen_by_other(
     surface = read_nearest(depth[1], there)
     # Of what is behind the camera, whose depth is negative, none is the same.
     same = (surface > 0) & ((surface - expected).abs() <= depth_tolerance * expected)
-    return _Seen(there, (own > 0) & in_image(there, image_size=size) & same)
+    return Seen(there, (own > 0) & in_image(there, image_size=size) & same)
 
 
 def _distances(projected: Tensor, found: Tensor) -> Tensor:
