@@ -76,13 +76,14 @@ def recomputed(
     compiling = torch.compiler.is_compiling()
     if not differentiated(*tensors):
         with torch.no_grad():
-            return _by_chunks(values, cut, *tensors)
+            return in_chunks(values, cut, *tensors)
     kind = _Traced if compiling else _Recomputed
     outputs: tuple[Tensor, ...] = kind.apply(function, values, cut, *tensors)  # type: ignore[no-untyped-call]
     return outputs
 
 
-def _by_chunks(function: Function, cut: Cut | None, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+def in_chunks(function: Function, cut: Cut | None, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+    """``function(*tensors)``, some points at a time."""
     if cut is None:
         return function(*tensors)
     parts = [function(*some) for some in chunks(cut, tensors, cut.inputs)]
@@ -120,7 +121,7 @@ class _Recomputed(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         ctx.cut = cut
-        return _kept(ctx, function, partial(_by_chunks, values, cut), tensors)
+        return _kept(ctx, function, partial(in_chunks, values, cut), tensors)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:

@@ -19,6 +19,8 @@ from deltas_geom.numerics.arithmetic import (
     promoted,
     without_autocast,
 )
+from deltas_geom.numerics.chunks import Cut
+from deltas_geom.numerics.evaluation import in_chunks
 from deltas_geom.numerics.vectors import dot
 from deltas_geom.triangulation.bearings import (
     Bearings,
@@ -85,22 +87,22 @@ def triangulate_robust_rays(
     check_bearings(cam_from_world, rays, weights, mask)
     if not 0 < threshold < math.pi / 2:
         raise ValueError(f"threshold must be positive and below pi / 2, got {threshold}")
+
+    def agreeing(rays: Tensor, *weighed: Tensor | None) -> tuple[Tensor, Tensor]:
+        cameras = _aimed(see_rays(cam_from_world, rays, None, None))
+        found = triangulate_robust(
+            cameras,
+            _pixels_of(cameras),
+            *map(_alone, weighed),
+            threshold=math.tan(threshold),
+            min_inliers=min_inliers,
+            max_pairs=max_pairs,
+        )
+        return found.inliers.squeeze(-1).mT, found.status.squeeze(-1)
+
     with torch.no_grad():
-        parts = []
-        for start in range(0, max(1, rays.shape[-2]), _CHUNK):
-            some = slice(start, start + _CHUNK)
-            cameras = _aimed(see_rays(cam_from_world, rays[..., some, :], None, None))
-            found = triangulate_robust(
-                cameras,
-                _pixels_of(cameras),
-                _alone(weights, some),
-                _alone(mask, some),
-                threshold=math.tan(threshold),
-                min_inliers=min_inliers,
-                max_pairs=max_pairs,
-            )
-            parts.append((found.inliers.squeeze(-1).mT, found.status.squeeze(-1)))
-        inliers, reason = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+        cut = Cut(_CHUNK, (-2, -1, -1), (-1, -1))
+        inliers, reason = in_chunks(agreeing, cut, rays, weights, mask)
     points = triangulate_rays(cam_from_world, rays, weights, inliers, covariance=covariance)
     return of_inliers(points, inliers, reason)
 
@@ -242,6 +244,6 @@ def _pixels_of(cameras: Tensor) -> Tensor:
     return cameras.new_zeros(cameras.shape[-3], 1, 2)
 
 
-def _alone(values: Tensor | None, points: slice = slice(None)) -> Tensor | None:
-    """Of some points ``(*B, V, N)``, as of one point in each batch item: ``(*B, N, V, 1)``."""
-    return None if values is None else values[..., points].mT.unsqueeze(-1)
+def _alone(values: Tensor | None) -> Tensor | None:
+    """Of points ``(*B, V, N)``, as of one point in each batch item: ``(*B, N, V, 1)``."""
+    return None if values is None else values.mT.unsqueeze(-1)

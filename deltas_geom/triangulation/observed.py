@@ -15,6 +15,7 @@ from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
 from deltas_geom.numerics.chunks import serial_points
 from deltas_geom.numerics.sums import product
+from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
 
 
@@ -36,8 +37,7 @@ def cameras_of(proj: Tensor) -> Cameras:
     """Tell finite cameras ``(*B, V, 3, 4)`` from others."""
     work = solver_dtype(proj)
     clean = proj.to(work)
-    limit = torch.finfo(work).max ** 0.25
-    finite = clean.detach().abs().amax(dim=(-2, -1)) < limit  # NaN is not below
+    finite = clean.detach().abs().amax(dim=(-2, -1)) < farthest(work)  # NaN is not below
     if not surely_all(finite):
         # Double where: what is not used must pass no gradient and no NaN.
         clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
@@ -117,6 +117,19 @@ def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     sound = torch.maximum(x.detach().abs(), y.detach().abs()) < limit  # NaN is not below
     # Double where: what is not used must pass no gradient and no NaN.
     return torch.where(sound, x, 0.0), torch.where(sound, y, 0.0), sound
+
+
+def clean_points(points: Tensor) -> tuple[Vector3, Tensor]:
+    """Points ``(*B, N, 3)`` in the solver's type, 0 where not finite; ``(*B, N)`` are they?"""
+    place = points.mT.to(solver_dtype(points)).contiguous()
+    finite = place.detach().abs().amax(dim=-2) < farthest(place.dtype)  # NaN is not below
+    # Double where: what is not used must pass no gradient and no NaN.
+    return torch.where(finite.unsqueeze(-2), place, 0.0).unbind(dim=-2), finite
+
+
+def farthest(work: torch.dtype) -> float:
+    """A coordinate so large that products of four overflow."""
+    return float(torch.finfo(work).max ** 0.25)
 
 
 def check_observed(

@@ -18,13 +18,15 @@ from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.symmetric3 import solve3_scaled
-from deltas_geom.numerics.vectors import Symmetric3, Vector3, either
+from deltas_geom.numerics.vectors import Symmetric3, Vector3, dot, either
 from deltas_geom.records import Record
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     Observations,
     cameras_of,
     check_observed,
+    clean_points,
+    farthest,
     homogeneous_in_views,
     observe,
 )
@@ -140,7 +142,7 @@ class _Problem(NamedTuple):
         proj: ``(*B, V, 3, 4)`` of the cameras.
         observed: pixels and weights.
         robust: the loss, see :func:`robust_loss`.
-        start: ``(*B, 3, N)`` m; 0 where not finite.
+        start: three ``(*B, N)`` m; 0 where not finite.
         sound: ``(*B, N)`` bool: finite, and two or more views are used.
         limit: m, where points stop to be representable.
     """
@@ -148,7 +150,7 @@ class _Problem(NamedTuple):
     proj: Tensor
     observed: Observations
     robust: _Loss
-    start: Tensor
+    start: Vector3
     sound: Tensor
     limit: float
 
@@ -163,16 +165,12 @@ def _pose(
 ) -> _Problem:
     cameras = cameras_of(proj)
     observed = observe(pixels, weights, mask, check_observed(proj, pixels, weights, mask))
-    place = points.mT.to(observed.x.dtype).contiguous()
-    limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
-    finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
-    start = torch.where(finite.unsqueeze(-2), place, 0.0)
+    start, finite = clean_points(points)
     # One broken view outweighs all that are used, so that one sum tells both.
     counted = observed.weights.used * (1 - proj.shape[-3] * cameras.broken).unsqueeze(-1)
     sound = observed.weights.sound & finite & (counted.sum(dim=-2) >= 2)
-    return _Problem(
-        cameras.proj, observed, robust, start, sound, min(limit, torch.finfo(points.dtype).max)
-    )
+    limit = min(farthest(cameras.proj.dtype), torch.finfo(points.dtype).max)
+    return _Problem(cameras.proj, observed, robust, start, sound, limit)
 
 
 class _Fit(NamedTuple):
@@ -219,8 +217,7 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
 
 
 def _descend(problem: _Problem, steps: int) -> _End:
-    points: Vector3 = problem.start.unbind(dim=-2)
-    fit = _fit(problem, points)
+    points, fit = problem.start, _fit(problem, problem.start)
     error, cost, valid = fit.error, fit.cost, problem.sound & (fit.cost < torch.inf)
     noise, moving = _rounding(problem, fit), valid
     for step in range(steps):
@@ -247,7 +244,7 @@ def _rounding(problem: _Problem, fit: _Fit) -> Tensor:
     by_depth = problem.observed.weights.squared * fit.inverse * fit.inverse
     size = problem.proj[..., :2, :].square().sum(dim=-2)  # of the rows
     turned, shifted = size[..., :3].sum(dim=-1, keepdim=True), size[..., 3:]
-    reach = problem.start.square().sum(dim=-2, keepdim=True)
+    reach = dot(problem.start, problem.start).unsqueeze(-2)
     squared = (torch.addcmul(shifted, turned, reach) * by_depth).sum(dim=-2)
     info = torch.finfo(squared.dtype)
     return squared.mul((16 * info.eps) ** 2).add(info.tiny**0.5)
@@ -284,7 +281,7 @@ def _descend_implicitly(problem: _Problem, steps: int) -> _End:
     points = tuple(
         # A gradient of 0 to the start, not a missing one; of the step no value.
         p + 0 * s + torch.where(strict & valid, d - d.detach(), 0.0)
-        for p, s, d in zip(end, problem.start.unbind(dim=-2), change, strict=True)
+        for p, s, d in zip(end, problem.start, change, strict=True)
     )
     return points, _fit(problem, points).error, valid
 
@@ -293,9 +290,9 @@ def _outward(
     problem: _Problem, points: Vector3, error: Tensor, valid: Tensor, *, dtype: torch.dtype
 ) -> tuple[Tensor, ...]:
     # What failed keeps the caller's own digits, and no gradient.
-    kept, total = problem.start.detach(), problem.observed.weights.squared.sum(dim=-2)
-    found = torch.where(valid.unsqueeze(-2), torch.stack(points, dim=-2), kept).mT
+    kept = either(valid, points, [component.detach() for component in problem.start])
+    found, total = torch.stack(kept, dim=-1), problem.observed.weights.squared.sum(dim=-2)
     # The largest squared weight is 1: less is no view.
     residual = safe_sqrt(torch.where(valid, error, 0.0) / total.clamp(min=1))
     residual = residual.clamp(max=torch.finfo(dtype).max)
-    return found.to(dtype).contiguous(), residual.to(dtype), valid
+    return found.to(dtype), residual.to(dtype), valid

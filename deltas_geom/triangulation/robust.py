@@ -3,7 +3,8 @@
 A point has few views, so all pairs are tried where RANSAC would draw some at random.
 """
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +17,8 @@ from deltas_geom.numerics.arithmetic import (
     unless_all,
     without_autocast,
 )
+from deltas_geom.numerics.chunks import Cut
+from deltas_geom.numerics.evaluation import in_chunks
 from deltas_geom.numerics.sums import product
 from deltas_geom.status import Status
 from deltas_geom.triangulation.judge import ok
@@ -102,11 +105,9 @@ def triangulate_robust(
         known = KnownCameras(proj)
         observed = _observe(known, pixels, weights, mask, batch)
         chunk = max(1, min(8192, _BUDGET // max(1, observed.usable.shape[:-1].numel())))
-        parts = [
-            _consensus(known, observed.some(start, chunk), threshold, min_inliers, max_pairs)
-            for start in range(0, max(1, pixels.shape[-2]), chunk)
-        ]
-        inliers, reason = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+        cut = Cut(chunk, (0, -2, -1, -1, -1, -1, 0, -1), (-1, -1))
+        agree = partial(_consensus, known, threshold, min_inliers, max_pairs)
+        inliers, reason = in_chunks(agree, cut, *observed)
     found = Call(known, pixels, weights, inliers, "rig").full(covariance=covariance)
     return of_inliers(found, inliers, reason)
 
@@ -133,18 +134,6 @@ class _Observations(NamedTuple):
     finite: Tensor
     centers: Tensor
     directions: Tensor
-
-    def some(self, start: int, count: int) -> "_Observations":
-        """Those of some points."""
-        points = slice(start, start + count)
-        return self._replace(
-            pixels=self.pixels[..., points, :],
-            weights=None if self.weights is None else self.weights[..., points],
-            squared=self.squared[..., points],
-            usable=self.usable[..., points],
-            finite=self.finite[..., points],
-            directions=self.directions[..., points],
-        )
 
 
 def _observe(
@@ -199,13 +188,10 @@ class _Best(NamedTuple):
 
 
 def _consensus(
-    known: KnownCameras,
-    observed: _Observations,
-    threshold: float,
-    min_inliers: int,
-    max_pairs: int,
+    known: KnownCameras, threshold: float, min_inliers: int, max_pairs: int, *tensors: Any
 ) -> tuple[Tensor, Tensor]:
     """Inliers ``(*B, V, N)``, and where there are none the status that says why ``(*B, N)``."""
+    observed = _Observations(*tensors)
     seen = observed.pixels, observed.weights
 
     def solved(used: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,13 @@ from deltas_geom.numerics.arithmetic import at_least_in_single, solver_dtype, wi
 from deltas_geom.numerics.symmetric3 import inverse3
 from deltas_geom.numerics.vectors import Symmetric3, Vector3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
-from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed, clean_pixels
+from deltas_geom.triangulation.observed import (
+    Cameras,
+    cameras_of,
+    check_observed,
+    clean_pixels,
+    clean_points,
+)
 from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
 from deltas_geom.triangulation.weights import weigh
 
@@ -41,7 +47,7 @@ def reprojection_residual(
     batch = check_observed(proj, pixels, weights, mask)
     check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
     batch = batch_shape(batch, points.shape[:-2])
-    cameras, (places, known) = cameras_of(proj), _clean_points(points)
+    cameras, (places, known) = cameras_of(proj), clean_points(points)
     x, y, sound = clean_pixels(pixels)
     healthy = (cameras.broken == 0).unsqueeze(-1)
     sound = (
@@ -72,7 +78,7 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
     """
     check_batch(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
     check_bool(used=used)
-    cameras, (places, known) = cameras_of(proj.detach()), _clean_points(points.detach())
+    cameras, (places, known) = cameras_of(proj.detach()), clean_points(points.detach())
     broken = cameras.broken.unsqueeze(-1) > 0
     sound = known & ~(broken & used).any(dim=-2)
     counted = (used & sound.unsqueeze(-2)).to(cameras.proj.dtype)
@@ -139,7 +145,7 @@ def point_covariance(
         pose_covariance=(pose_covariance, "V 6 6"),
     )
     check_bool(mask=mask)
-    cameras, (places, known) = cameras_of(proj), _clean_points(points)
+    cameras, (places, known) = cameras_of(proj), clean_points(points)
     work = cameras.proj.dtype
     sound, noise = cameras.broken == 0, None
     if pose_covariance is not None:
@@ -193,15 +199,6 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
     variance = torch.einsum("...vnj,...vj->...vn", along, axis) * size[..., 0].mT
     limit = torch.finfo(dtype).max
     return variance.clamp(-limit, limit).to(dtype)
-
-
-def _clean_points(points: Tensor) -> tuple[Vector3, Tensor]:
-    """Points ``(*B, N, 3)`` in the solver's type, 0 where not finite; ``(*B, N)`` are they?"""
-    place = points.mT.to(solver_dtype(points))
-    limit = torch.finfo(place.dtype).max ** 0.25  # products of four overflow
-    finite = place.detach().abs().amax(dim=-2) < limit  # NaN is not below
-    # Double where: what is not used must pass no gradient and no NaN.
-    return torch.where(finite.unsqueeze(-2), place, 0.0).unbind(dim=-2), finite
 
 
 def representable(covariance: Tensor, dtype: torch.dtype) -> Tensor:
