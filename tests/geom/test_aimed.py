@@ -193,7 +193,7 @@ def test_scipy_finds_the_same_points() -> None:
     rays = rays + 0.02 * torch.randn(rays.shape, generator=generator, dtype=torch.float64)
     ours = geom.refine_rays(poses, rays, point, steps=20).points[0]
 
-    def tangents(point):  # type: ignore[no-untyped-def]
+    def tangents(point):
         away = angles(poses, rays, torch.from_numpy(point)[None])[:, 0]
         return away.tan().numpy()
 

@@ -15,7 +15,6 @@ from deltas_geom import (
     epipolar_distance,
     epipolar_lines,
     fundamental_between,
-    to_homogeneous,
 )
 from deltas_geom.testing import PosedScene, forward_motion, rigid, zero_baseline
 from deltas_geom.testing.invariants import INVARIANTS, World
@@ -46,14 +45,6 @@ def test_wrong_shapes_are_named() -> None:
 @pytest.mark.parametrize("name", EXACT)
 def test_lines_are_exact(name: str, scene: PosedScene) -> None:
     INVARIANTS[name](OURS, scene, tolerance=1e-8)  # px
-
-
-@given(scene=posed_scenes())
-def test_the_epipolar_constraint_holds(scene: PosedScene) -> None:
-    fundamental = fundamental_between(scene.views)
-    first, second = to_homogeneous(scene.pixels)
-    product = (second * (first @ fundamental.mT)).sum(dim=-1)
-    assert_close(product, torch.zeros_like(product), rtol=0, atol=1e-12)  # metres of baseline
 
 
 @given(scene=posed_scenes(num_views=3))

@@ -207,7 +207,7 @@ def test_points_are_as_exact_as_an_svd_makes_them(
         exact, exact_in_world = known.exact[frame], known.exact["world"]
         by_svd, by_world_svd = known.by_svd[frame], known.by_svd["world"]
         with by(way):
-            found = triangulate(case.proj, case.pixels, case.weights, frame=frame)  # type: ignore[arg-type]
+            found = triangulate(case.proj, case.pixels, case.weights, frame=frame)
         # Noise of 1000 baselines leaves little to the world's frame: most points lie behind.
         assert found.valid.sum() >= (2 if "baselines" in name else COUNT // 2)
         ours, theirs = [], []

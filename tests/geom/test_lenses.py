@@ -45,7 +45,7 @@ def test_names_and_counts_that_are_wrong_are_told_with_the_right_ones() -> None:
     with pytest.raises(geom.ShapeError, match="K must have shape"):
         Lens(torch.eye(4), torch.zeros(4), "OPENCV")
     with pytest.raises(TypeError, match="coefficients must be"):
-        Lens(K, [0.0] * 4, "OPENCV")  # type: ignore[arg-type]
+        Lens(K, [0.0] * 4, "OPENCV")
 
 
 def assert_there_and_back(case: Case, pixels: Tensor) -> Tensor:

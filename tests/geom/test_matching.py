@@ -223,21 +223,6 @@ def test_a_match_without_variance_weighs_one_by_the_floor(dtype: torch.dtype) ->
     assert (weights[0] == 4).all() and (weights[1] < 4).all()
 
 
-def test_scores_of_views_that_see_nothing_do_not_count() -> None:
-    scene = forward_motion()
-    samples = sample_inv_depths(scene.views, scene.pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
-    blind = samples._replace(mask=torch.zeros_like(samples.mask))
-    scores = torch.full((1, 3, 1, 31), torch.nan, dtype=torch.float64, requires_grad=True)
-    for matches in (
-        match_joint(scene.views, scene.pixels[0], scores, blind, image_size=IMAGE_SIZE),
-        match_per_view(scene.pixels[0], scores, blind),
-    ):
-        assert all(value.isfinite().all() for value in matches)
-        assert (matches.weights[1:] == 0).all()
-        gradient = torch.autograd.grad(matches.pixels.sum(), scores, allow_unused=True)[0]
-        assert gradient is None or (gradient == 0).all()
-
-
 def test_gradients_are_right() -> None:
     generator = torch.Generator().manual_seed(0)
 

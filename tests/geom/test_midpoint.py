@@ -89,7 +89,7 @@ def test_the_step_ends_near_the_least_angles(angle: float) -> None:
     before, after = torch.zeros(20), torch.zeros(20)
     for one in range(20):
 
-        def sines(point, one=one):  # type: ignore[no-untyped-def]
+        def sines(point, one=one):
             offset = point - centers[:, 0]
             offset = offset / (offset**2).sum(axis=1, keepdims=True) ** 0.5
             along = (offset * directions[:, one]).sum(axis=1, keepdims=True)

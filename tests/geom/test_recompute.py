@@ -271,7 +271,7 @@ def test_an_adjoint_spares_the_function_except_where_more_is_asked() -> None:
     both = WithAdjoint(function, adjoint)
     kept: list[Tensor] = []
     with torch.autograd.graph.saved_tensors_hooks(
-        lambda tensor: kept.append(tensor) or tensor,  # type: ignore[func-returns-value]
+        lambda tensor: kept.append(tensor) or tensor,
         lambda tensor: tensor,
     ):
         found = recomputed(both, x, y, values=root)[0]

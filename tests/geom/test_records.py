@@ -100,11 +100,11 @@ def test_values_of_cameras_in_half_precision_are_checked(half: torch.dtype) -> N
 def test_posed_views_of_arrays_are_refused_at_once() -> None:
     K, poses = np.eye(3)[None], np.eye(4)[None]
     with pytest.raises(TypeError, match=r"K must be .*, got ndarray: use torch\.from_numpy\(K\)"):
-        geom.PosedViews(K, poses)  # type: ignore[arg-type]
+        geom.PosedViews(K, poses)
     with pytest.raises(TypeError, match=r"cam_from_world must be .*, got list: use torch\.stack"):
-        geom.PosedViews(torch.eye(3)[None], list(torch.eye(4)[None]))  # type: ignore[arg-type]
+        geom.PosedViews(torch.eye(3)[None], list(torch.eye(4)[None]))
     views = geom.PosedViews(torch.eye(3)[None], torch.eye(4)[None])
     with pytest.raises(TypeError, match=r"proj must be .*, got PosedViews: use proj\.proj"):
-        geom.triangulate(views, torch.zeros(1, 5, 2))  # type: ignore[arg-type]
+        geom.triangulate(views, torch.zeros(1, 5, 2))
     with pytest.raises(TypeError, match=r"views must be PosedViews, got Tensor"):
-        geom.project(views.proj, torch.zeros(5, 3))  # type: ignore[arg-type]
+        geom.project(views.proj, torch.zeros(5, 3))

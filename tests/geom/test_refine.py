@@ -19,9 +19,9 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ShapeError, match="points has N = 4 but pixels has N = 5"):
         refine_points(proj, pixels, points[:4])
     with pytest.raises(ValueError, match="or 'cauchy', got 'l1'"):
-        refine_points(proj, pixels, points, loss="l1")  # type: ignore[arg-type]
+        refine_points(proj, pixels, points, loss="l1")
     with pytest.raises(ValueError, match="or 'implicit', got 'none'"):
-        refine_points(proj, pixels, points, gradient="none")  # type: ignore[arg-type]
+        refine_points(proj, pixels, points, gradient="none")
     with pytest.raises(ValueError, match="steps must not be negative, got -1"):
         refine_points(proj, pixels, points, steps=-1)
     with pytest.raises(ValueError, match="scale must be positive, got 0"):

@@ -47,7 +47,7 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="num_samples must be at least 2, got 1"):
         sample_segments(segments, 1)
     with pytest.raises(ValueError, match="spacing must be 'inv_depth' or 'pixels', got 'depth'"):
-        sample_segments(segments, 4, spacing="depth")  # type: ignore[arg-type]
+        sample_segments(segments, 4, spacing="depth")
     with pytest.raises(ShapeError, match="feature_map must have shape"):
         sample_map(torch.zeros(4, 4), torch.zeros(1, 2), image_size=(4, 4))
     with pytest.raises(ShapeError, match="inv_depths must have shape"):
@@ -69,7 +69,7 @@ def test_samples_are_finite(scene: PosedScene, pixels: Tensor) -> None:
 @pytest.mark.parametrize("spacing", SPACINGS)
 def test_the_outer_samples_are_the_ends(spacing: str, scene: PosedScene) -> None:
     segments = segments_of(scene)
-    samples = sample_segments(segments, 6, spacing=spacing)  # type: ignore[arg-type]
+    samples = sample_segments(segments, 6, spacing=spacing)
     assert_close(samples.pixels[..., 0, 0, :], segments.start, rtol=0, atol=0)
     assert_close(samples.pixels[..., 0, -1, :], segments.end, rtol=0, atol=1e-9)  # px
     assert_close(samples.inv_depth[..., -1], segments.inv_depth_end, rtol=1e-12, atol=0)
@@ -242,6 +242,6 @@ def test_an_end_near_the_cameras_plane_does_not_overshoot() -> None:
     for foreshortening in (1e-17, 1e17):
         segments = Segments(0 * end, end, 0.1 * one, one, status, foreshortening * one)
         for spacing in SPACINGS:
-            samples = sample_segments(segments, 5, spacing=spacing)  # type: ignore[arg-type]
+            samples = sample_segments(segments, 5, spacing=spacing)
             assert samples.inv_depth.max() <= 1 and samples.inv_depth.min() >= 0.1
             assert samples.inv_depth[0, 0, -1] == 1 and samples.pixels[0, 0, 0, -1, 0] == 100

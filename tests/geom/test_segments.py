@@ -277,7 +277,7 @@ def test_a_range_behind_the_source_is_empty_with_zero_gradient() -> None:
     segments = epipolar_segments(views, pixels, depth_range=(0.1, 0.4), image_size=IMAGE_SIZE)
     assert segments.status.item() == Status.EMPTY and not segments.visible.any()
     total = sum(value.sum() for value in segments[:4])
-    assert total.item() == 0  # type: ignore[union-attr]
+    assert total.item() == 0
     assert (torch.autograd.grad(total, pixels)[0] == 0).all()
 
 

@@ -61,7 +61,7 @@ def test_with_that_tolerance_half_a_pixel_is_still_found(feature: str, place: in
         moved[place] = moved[place] + 0.5
         return ours(feature)(*moved)
 
-    assert failures(Target("half a pixel", tolerance=3e-3, **{feature: shifted}))  # type: ignore[arg-type]
+    assert failures(Target("half a pixel", tolerance=3e-3, **{feature: shifted}))
 
 
 def test_a_tolerance_is_of_its_target_alone() -> None:

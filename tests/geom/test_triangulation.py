@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("way")
 def test_wrong_arguments_are_named() -> None:
     proj, pixels = torch.zeros(2, 3, 4), torch.zeros(2, 5, 2)
     with pytest.raises(ValueError, match="frame must be 'rig' or 'world', got 'rigid'"):
-        triangulate(proj, pixels, frame="rigid")  # type: ignore[arg-type]
+        triangulate(proj, pixels, frame="rigid")
 
 
 @given(drawn=noisy(), far=scales(decades=9))
@@ -59,7 +59,7 @@ def test_a_masked_camera_may_stand_anywhere(drawn: tuple[PosedScene, Tensor], fa
 def test_the_answer_is_that_of_an_svd(frame: str, drawn: tuple[PosedScene, Tensor]) -> None:
     scene, weights = drawn
     proj = scene.views.proj
-    ours = triangulate_points(proj, scene.pixels, weights, frame=frame)  # type: ignore[arg-type]
+    ours = triangulate_points(proj, scene.pixels, weights, frame=frame)
     if frame == "world":
         assert_close(ours, svd_points(proj, scene.pixels, weights), rtol=0, atol=1e-8)  # m
         return

@@ -16,7 +16,6 @@ from deltas_geom.numerics import sums
 from deltas_geom.testing import forward_motion, rigid
 from deltas_geom.testing.fixed_scenes import seeded_scene
 from deltas_geom.testing.strategies import vectors
-from deltas_geom.triangulation import triangulate as dispatch
 
 TYPES = pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
 FRAMES = pytest.mark.parametrize("frame", ["rig", "world"])
@@ -85,8 +84,8 @@ def asked(draw: st.DrawFn, *, far: float) -> Asked:
 
 def answered(request: Asked, frame: str, way: str) -> Fields:
     with by(way):
-        result = triangulate(*request, frame=frame, covariance=True)  # type: ignore[arg-type]
-        points = triangulate_points(*request, frame=frame)  # type: ignore[arg-type]
+        result = triangulate(*request, frame=frame, covariance=True)
+        points = triangulate_points(*request, frame=frame)
     assert torch.equal(result.points, points)
     return {name: value for name, value in result._asdict().items() if value is not None}
 
@@ -120,7 +119,7 @@ def pulled(request: Asked, frame: str, way: str) -> list[Tensor]:
         x if x is None or k == 3 else x.detach().requires_grad_() for k, x in enumerate(request)
     ]
     with by(way):
-        points = triangulate_points(*inputs, frame=frame)  # type: ignore[arg-type]
+        points = triangulate_points(*inputs, frame=frame)
         share = torch.arange(1.0, 1.0 + points.numel(), dtype=points.dtype).view_as(points)
         total = (points * share / points.numel()).sum()
         return list(torch.autograd.grad(total, [inputs[k] for k in request.real()]))
@@ -139,7 +138,7 @@ def test_both_adjoints_are_the_derivative_of_all_that_is_computed(
         full = list(request)
         for place, tensor in zip(real, some, strict=True):
             full[place] = tensor
-        return triangulate_points(*full, frame=frame)  # type: ignore[arg-type]
+        return triangulate_points(*full, frame=frame)
 
     points, pull = torch.func.vjp(solve, *(request[k] for k in real))
     share = torch.arange(1.0, 1.0 + points.numel(), dtype=points.dtype).view_as(points)
@@ -150,20 +149,6 @@ def test_both_adjoints_are_the_derivative_of_all_that_is_computed(
             assert ours.isfinite().all()
             size = 1 + float(theirs.abs().max())
             assert_close(ours, theirs, rtol=0, atol=bound * size, msg=lambda m, w=way: f"{w}: {m}")
-
-
-def test_more_points_than_few_are_solved_as_these_are() -> None:
-    scene, few = forward_motion(), dispatch.FEW
-    generator = torch.Generator().manual_seed(0)
-    pixels = scene.pixels.repeat(1, few, 1)[:, : few + 1]
-    pixels = pixels + torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
-    for some in (pixels, torch.stack([pixels, pixels + 1])):
-        many = triangulate(scene.views.proj, some, covariance=True)
-        part = triangulate(scene.views.proj, some[..., : few // 2, :], covariance=True)
-        for name, value in part._asdict().items():
-            whole = getattr(many, name)
-            dim = -3 if name == "covariance" else -2 if name == "points" else -1
-            assert_close(whole.narrow(dim, 0, few // 2), value, rtol=1e-9, atol=1e-9)
 
 
 LAYOUTS = {

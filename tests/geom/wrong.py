@@ -17,7 +17,7 @@ def ours(feature: str) -> Function:
 
 def before(name: str, feature: str, change: Function) -> Target:
     """Ours, given other arguments."""
-    return Target(name, **{feature: lambda *given: ours(feature)(*change(*given))})  # type: ignore[arg-type]
+    return Target(name, **{feature: lambda *given: ours(feature)(*change(*given))})
 
 
 def after(name: str, feature: str, change: Function) -> Target:
@@ -27,4 +27,4 @@ def after(name: str, feature: str, change: Function) -> Target:
         result = ours(feature)(*given)
         return change(*result) if isinstance(result, tuple) else change(result)
 
-    return Target(name, **{feature: call})  # type: ignore[arg-type]
+    return Target(name, **{feature: call})
