@@ -34,14 +34,20 @@ class Cameras(NamedTuple):
 
 
 def cameras_of(proj: Tensor) -> Cameras:
-    """Tell finite cameras ``(*B, V, 3, 4)`` from others."""
+    """Cameras ``(*B, V, 3, 4)`` with their centres."""
+    clean, broken = finite_cameras(proj)
+    return Cameras(clean, broken, projection_centers(clean))
+
+
+def finite_cameras(proj: Tensor) -> tuple[Tensor, Tensor]:
+    """Tell finite cameras ``(*B, V, 3, 4)`` from others: the first fields of :class:`Cameras`."""
     work = solver_dtype(proj)
     clean = proj.to(work)
     finite = clean.detach().abs().amax(dim=(-2, -1)) < farthest(work)  # NaN is not below
     if not surely_all(finite):
         # Double where: what is not used must pass no gradient and no NaN.
         clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
-    return Cameras(clean, (~finite).to(work), projection_centers(clean))
+    return clean, (~finite).to(work)
 
 
 class Observations(NamedTuple):

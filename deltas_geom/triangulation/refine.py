@@ -23,10 +23,10 @@ from deltas_geom.records import Record
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     Observations,
-    cameras_of,
     check_observed,
     clean_points,
     farthest,
+    finite_cameras,
     homogeneous_in_views,
     observe,
 )
@@ -113,9 +113,9 @@ def refine_points(
         >>> refined.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    batch = check_observed(proj, pixels, weights, mask)
+    seen = check_observed(proj, pixels, weights, mask)
     check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    batch_shape(batch, points.shape[:-2])
+    batch_shape(seen, points.shape[:-2])
     if loss not in ("squared", "huber", "cauchy"):
         raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy', got {loss!r}")
     if gradient not in ("unrolled", "implicit"):
@@ -125,7 +125,7 @@ def refine_points(
     check_positive(scale=scale)
 
     def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:
-        problem = _pose(partial(robust_loss, loss, scale), *inputs)
+        problem = _pose(partial(robust_loss, loss, scale), seen, *inputs)
         return _outward(problem, *descend(problem, steps), dtype=points.dtype)
 
     unrolled, implicit = partial(refined, _descend), partial(refined, _descend_implicitly)
@@ -157,20 +157,21 @@ class _Problem(NamedTuple):
 
 def _pose(
     robust: _Loss,
+    batch: torch.Size,
     proj: Tensor,
     pixels: Tensor,
     points: Tensor,
     weights: Tensor | None,
     mask: Tensor | None,
 ) -> _Problem:
-    cameras = cameras_of(proj)
-    observed = observe(pixels, weights, mask, check_observed(proj, pixels, weights, mask))
+    cameras, broken = finite_cameras(proj)
+    observed = observe(pixels, weights, mask, batch)
     start, finite = clean_points(points)
     # One broken view outweighs all that are used, so that one sum tells both.
-    counted = observed.weights.used * (1 - proj.shape[-3] * cameras.broken).unsqueeze(-1)
+    counted = observed.weights.used * (1 - proj.shape[-3] * broken).unsqueeze(-1)
     sound = observed.weights.sound & finite & (counted.sum(dim=-2) >= 2)
-    limit = min(farthest(cameras.proj.dtype), torch.finfo(points.dtype).max)
-    return _Problem(cameras.proj, observed, robust, start, sound, limit)
+    limit = min(farthest(cameras.dtype), torch.finfo(points.dtype).max)
+    return _Problem(cameras, observed, robust, start, sound, limit)
 
 
 class _Fit(NamedTuple):

@@ -11,11 +11,12 @@ from deltas_geom.numerics.symmetric3 import inverse3
 from deltas_geom.numerics.vectors import Symmetric3, Vector3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
-    Cameras,
     cameras_of,
     check_observed,
     clean_pixels,
     clean_points,
+    finite_cameras,
+    projection_centers,
 )
 from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
 from deltas_geom.triangulation.weights import weigh
@@ -47,15 +48,15 @@ def reprojection_residual(
     batch = check_observed(proj, pixels, weights, mask)
     check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
     batch = batch_shape(batch, points.shape[:-2])
-    cameras, (places, known) = cameras_of(proj), clean_points(points)
+    (cameras, broken), (places, known) = finite_cameras(proj), clean_points(points)
     x, y, sound = clean_pixels(pixels)
-    healthy = (cameras.broken == 0).unsqueeze(-1)
+    healthy = (broken == 0).unsqueeze(-1)
     sound = (
         healthy.expand(*healthy.shape[:-1], points.shape[-2]) if sound is None else sound & healthy
     )
     weighed = weigh(weights, mask, batch=batch, like=weights.unsqueeze(-1), sound=sound)
     used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
-    residual = residual_of(reproject(cameras.proj, places, used), x, y, weighed.squared)
+    residual = residual_of(reproject(cameras, places, used), x, y, weighed.squared)
     return residual.clamp(max=torch.finfo(proj.dtype).max).to(proj.dtype)
 
 
@@ -145,9 +146,8 @@ def point_covariance(
         pose_covariance=(pose_covariance, "V 6 6"),
     )
     check_bool(mask=mask)
-    cameras, (places, known) = cameras_of(proj), clean_points(points)
-    work = cameras.proj.dtype
-    sound, noise = cameras.broken == 0, None
+    (cameras, broken), (places, known) = finite_cameras(proj), clean_points(points)
+    work, sound, noise = cameras.dtype, broken == 0, None
     if pose_covariance is not None:
         stated = _fits(pose_covariance.to(work), torch.finfo(work).max ** 0.25)
         noise = torch.where(stated, pose_covariance, 0.0).to(work)
@@ -155,8 +155,8 @@ def point_covariance(
     like = weights.unsqueeze(-1)
     weighed = weigh(weights, mask, batch=batch, like=like, sound=sound.unsqueeze(-1))
     used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
-    seen = reproject(cameras.proj, places, used)
-    entries = covariance_of(cameras.proj, seen, weighed.squared)
+    seen = reproject(cameras, places, used)
+    entries = covariance_of(cameras, seen, weighed.squared)
     found, of_pixels = unscaled(entries, weighed.largest.squeeze(-2)), unpacked3(entries)
     if noise is not None:
         # Double where: products of what is as good as infinite would be NaN.
@@ -187,13 +187,13 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
     """
     check_batch(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
-    cameras, work = cameras_of(proj), solver_dtype(proj)
+    (cameras, _), work = finite_cameras(proj), solver_dtype(proj)
     finite = _fits(covariance, torch.finfo(covariance.dtype).max)
     spread = torch.where(finite, covariance, 0.0).to(work)
     with torch.no_grad():
         size = spread.abs().amax(dim=(-2, -1), keepdim=True)
         size = torch.where(size > 0, size, 1.0)
-    axis = cameras.proj[..., 2, :3]
+    axis = cameras[..., 2, :3]
     # Of shares of the largest entry, which may be the largest number that there is.
     along = torch.einsum("...vi,...nij->...vnj", axis, spread / size)
     variance = torch.einsum("...vnj,...vj->...vn", along, axis) * size[..., 0].mT
@@ -256,7 +256,7 @@ def unscaled(entries: Sequence[Tensor], largest: Tensor) -> Tensor:
 
 
 def _of_poses(
-    cameras: Cameras,
+    cameras: Tensor,
     points: Vector3,
     found: Reprojection,
     squared: Tensor,
@@ -269,13 +269,15 @@ def _of_poses(
     would have seen X - d + (X - c) x r.
     """
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
-    view = cameras.proj.unsqueeze(-3)  # each view alone, to keep their information apart
+    view = cameras.unsqueeze(-3)  # each view alone, to keep their information apart
     x, y, w = (tensor.unsqueeze(-2) for tensor in (found.x, found.y, by_depth))
     normal = normal_matrix(normal_coefficients(view[..., :3]), x, y, w)
     information = unpacked3(normal)  # (*B, V, N, 3, 3)
     ox, oy, oz = (
         component.unsqueeze(-2) - center.unsqueeze(-1)
-        for component, center in zip(points, cameras.centers.unbind(dim=-1), strict=True)
+        for component, center in zip(
+            points, projection_centers(cameras).unbind(dim=-1), strict=True
+        )
     )  # (*B, V, N)
     zero, one = torch.zeros_like(ox), torch.ones_like(ox)
     moved = torch.stack(
