@@ -7,36 +7,28 @@
 
 The sets are those of CAPTURE/view_sets.json where it has one, and chosen ones for all other frames.
 Scored are the anchors of CAPTURE/view_sets.json if there is one, else all maps. Edges are where the
-log of the true depth jumps by 0.1 between neighbours, and four pixels around. Flicker compares
-successive maps at places that both see, as the true depth has it (to 2 %): by how much the log of
-their errors differs, so that what the truth itself flickers is left out.
+log of the true depth jumps by 0.1 between neighbours, and four pixels around. Flicker is that of
+`deltas evaluate --consistency`.
 """
 
 import json
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from skimage.morphology import dilation, footprint_rectangle
 
-from deltas_geom import PosedViews, project, unproject
-from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets import open_capture
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.usable import usable_view_sets
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.evaluate.consistency import SeenMaps, shrunk
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
 from deltas_nets.outputs.depth_formats import read_depth_map
 from deltas_nets.outputs.summary import recorded_depth_scale, recorded_view_sets
 
-SIZE = (270, 360)
-"""(height, width) at which edges and flicker are measured."""
-SAME = 0.02
 JUMP = 0.1
 Map = NDArray[np.float32]
 
@@ -89,47 +81,12 @@ def errors(capture: Capture, folder: Path, ids: list[str]) -> str:
 
 
 def flicker(capture: Capture, folder: Path, ids: list[str]) -> str:
-    scale, found = recorded_depth_scale(folder), []
-    off = {id: None for id in ids}
-    for one, other in pairwise(ids):
-        true = [shrunk(depth_at_image(capture.frame(id))) for id in (one, other)]
-        here, there = same_places(capture.frame(one), capture.frame(other), *true)
-        if len(here) < 500:
-            continue
-        for id, depth in zip((one, other), true, strict=True):
-            if off[id] is None:
-                map_ = shrunk(read_depth_map(folder, id, scale)).astype(np.float64)
-                off[id] = np.log(np.where((map_ > 0) & (depth > 0), map_ / depth.clip(1e-3), 1))
-        first, second = off[one].ravel()[here], off[other].ravel()[there]
-        found.append(float(np.abs(first - second).mean()))
-    return f"{np.mean(found):.4f} ({len(found)})" if found else "no pair"
-
-
-def same_places(one: Frame, other: Frame, here: Map, there: Map) -> tuple[NDArray, NDArray]:
-    """Pixels of two frames that show the same place, by the true depth of both."""
-    rows, columns = np.nonzero((here > 0.5) & (here < 10))
-    pixels = torch.from_numpy(np.stack([columns, rows], axis=-1)).double()[None]
-    depth = torch.from_numpy(here[rows, columns]).double()[None]
-    seen = project(view(other), unproject(view(one), pixels, depth)[0])
-    column, row = (seen.pixels[0] + 0.5).floor().long().unbind(dim=-1)
-    inside = seen.in_front[0] & (column >= 0) & (column < SIZE[1]) & (row >= 0) & (row < SIZE[0])
-    place = (row * SIZE[1] + column).clamp(0, SIZE[0] * SIZE[1] - 1).numpy()
-    z = seen.depth[0].numpy()
-    true = there.ravel()[place]
-    same = inside.numpy() & (true > 0.5) & (true < 10) & (np.abs(true / z - 1) < SAME)
-    return (rows * SIZE[1] + columns)[same], place[same]
-
-
-def view(frame: Frame) -> PosedViews:
-    K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=SIZE)
-    return PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
-
-
-def shrunk(image: Map) -> Map:
-    """The pixel that holds each new centre."""
-    rows = ((np.arange(SIZE[0]) + 0.5) * image.shape[0] / SIZE[0]).astype(int)
-    columns = ((np.arange(SIZE[1]) + 0.5) * image.shape[1] / SIZE[1]).astype(int)
-    return image[rows[:, None], columns]
+    maps, scale = SeenMaps(), recorded_depth_scale(folder)
+    for id in ids:
+        frame = capture.frame(id)
+        maps.add(frame, read_depth_map(folder, id, scale), depth_at_image(frame))
+    found = maps.result()
+    return f"{found.flicker:.4f} ({found.successive})" if found.successive else "no pair"
 
 
 def edges(depth: Map) -> NDArray[np.bool_]:

@@ -91,8 +91,8 @@ class Evaluate(Prediction):
             if file is not None:
                 check_writable(file.parent)
         scores, title = self._of_rooms() if self.rooms is not None else self._of_scenes()
+        self._write(scores)  # before the reader of what is printed may have had enough
         self._print(scores, title)
-        self._write(scores)
         if scores.failures:
             failed = {**scores.total.failed, **scores.failed}
             said = f"frames and scenes that failed: {scores.failures}; the first, "

@@ -23,7 +23,7 @@ from deltas_nets.network.paper.taps import Taps, imagenet_normalised
 from deltas_nets.reference.batch import batch_and_views
 from deltas_nets.reference.enlarge import enlarge_by_rows
 from deltas_nets.reference.features import heatmap_of, shown_features
-from deltas_nets.reference.keypoints import DetectedKeypoints, fill_keypoints, pick_keypoints
+from deltas_nets.reference.keypoints import DetectedKeypoints, pick_keypoints
 from deltas_nets.reference.outputs import (
     DensifyOutputs,
     MatchOutputs,
@@ -34,13 +34,8 @@ from deltas_nets.reference.outputs import (
 from deltas_nets.reference.points import draw_sparse_depth, triangulate_pixels
 from deltas_nets.reference.precision import full_precision
 from deltas_nets.reference.scores import MatchNorm, correlate_samples, read_matches
-from deltas_nets.reference.segments import (
-    NUM_SAMPLES,
-    OFFSET,
-    reference_segments,
-    segment_samples,
-)
-from deltas_nets.reference.settings import PUBLISHED
+from deltas_nets.reference.segments import reference_segments, segment_samples
+from deltas_nets.reference.settings import PUBLISHED, choose_keypoints
 
 Indices = Tensor | Sequence[int]
 
@@ -128,8 +123,7 @@ class ReferenceNetwork(nn.Module):
         cam_from_anchor: Tensor,
         *,
         probe_points: Indices = (),
-        num_samples: int = NUM_SAMPLES,
-        offset: float = OFFSET,
+        settings: NetworkSettings = PUBLISHED,
     ) -> MatchOutputs:
         """Match and triangulate the anchors' key points.
 
@@ -140,18 +134,19 @@ class ReferenceNetwork(nn.Module):
             intrinsics: ``(B, 3, 3)``, the same for all views.
             cam_from_anchor: ``(B, V, 4, 4)`` of the sources, metres.
             probe_points: P indices of key points to show in detail.
-            num_samples: along a segment.
-            offset: of the lines beside the epipolar line, pixels.
+            settings: of the samples; what is not given is as in :data:`PUBLISHED`.
 
         Raises:
             ShapeError: a shape differs.
         """
         batch, views = batch_and_views(descriptors, keypoints, intrinsics, cam_from_anchor)
         size = (CELL * descriptors.shape[-2], CELL * descriptors.shape[-1])
+        given = PUBLISHED.given() | settings.given()
+        offset: float = given["offset"]
         probe = torch.as_tensor(probe_points, dtype=torch.long, device=keypoints.device)
         with full_precision(keypoints.device):
             segments = reference_segments(keypoints, intrinsics, cam_from_anchor, image_size=size)
-            samples = segment_samples(segments, num_samples=num_samples, offset=offset)
+            samples = segment_samples(segments, num_samples=given["num_samples"], offset=offset)
             maps = descriptors.view(1 + views, batch, *descriptors.shape[1:]).transpose(0, 1)
             correlation = correlate_samples(maps, keypoints, samples)
             scores = self.match_norm(correlation)
@@ -231,9 +226,7 @@ class ReferenceNetwork(nn.Module):
             intrinsics: ``(1, 3, 3)``, the same for all views.
             cam_from_anchor: ``(1, V, 4, 4)`` of the sources, metres.
             probe_points: P indices of key points to show in detail.
-            num_points: for the detected key points, see :meth:`pick`.
-            radius: for the detected key points.
-            threshold: for the detected key points.
+            num_points, radius, threshold: for the detected key points, see :meth:`pick`.
 
         Raises:
             ShapeError: a shape differs, or there is more than one anchor.
@@ -298,23 +291,11 @@ class ReferenceNetwork(nn.Module):
         Raises:
             ShapeError: a shape differs, or there is more than one anchor.
         """
-        given = PUBLISHED.given() | settings.given()
         features = self.features(images)
-        detected = self.pick(
-            features.detector.logits[0],
-            num_points=given["num_points"],
-            radius=given["nms_radius"],
-            threshold=given["threshold"],
-            fraction=given["detected_share"],
-        )
-        xy, score = fill_keypoints(detected, num_points=given["num_points"], generator=generator)
+        heatmap = heatmap_of(features.detector.logits[0])
+        xy, score = choose_keypoints(heatmap, settings, generator=generator)
         matched = self.match(
-            features.descriptor.unit,
-            xy[None],
-            intrinsics,
-            cam_from_anchor,
-            num_samples=given["num_samples"],
-            offset=given["offset"],
+            features.descriptor.unit, xy[None], intrinsics, cam_from_anchor, settings=settings
         )
         densified = self.densify(
             features.taps.of_first(1), xy[None], matched.points_3d, matched.in_range

@@ -71,6 +71,10 @@ def test_all_is_the_mean_over_frames_of_the_scenes(two_scenes: Path, evaluated: 
     assert every["frames"] == 5
     assert every["abs_rel"] == said["metrics"]["dense"]["abs_rel"]
     assert next(iter(said["abs_rel_by_frame"])) == "a/0"
+    for way, prefix in (("median-scaled", "median_"), ("scale and shift", "scale_shift_")):
+        row = next(r for r in rows if r["scene"] == "all" and r["scores"] == way)
+        assert row["rmse"] == pytest.approx(np.mean([f[f"{prefix}rmse"] for f in frames]))
+        assert row["rmse"] != pytest.approx(every["rmse"], rel=1e-3)
     # All maps have as many pixels here, so that pooling changes roots alone.
     pooled = next(row for row in rows if row["scene"] == "all" and row["scores"] == "pooled")
     assert pooled["abs_rel"] == pytest.approx(every["abs_rel"])
@@ -203,9 +207,17 @@ def test_maps_in_files_are_scored_scene_by_scene(
     assert "ause" not in said  # maps in files state no deviation
     found = (scores["scenes"]["a"]["consistency"] for scores in (direct, said))
     assert next(found) == pytest.approx(next(found), abs=5e-3)
+    # Another program leaves maps alone; a file says which there must be.
+    (tmp_path / "maps" / "b" / "summary.json").unlink()
+    sets = tmp_path / "sets.json"
+    sets.write_text('[{"anchor": 0, "sources": [1]}]')
+    other = evaluated(
+        two_scenes / "b", "--predictions", tmp_path / "maps" / "b", "--view-sets", sets
+    )
+    assert other["abs_rel_by_frame"] == {"0": said["abs_rel_by_frame"]["b/0"]}
     (tmp_path / "maps" / "a" / "depth" / "1.png").unlink()
-    gone = evaluated(two_scenes, "--predictions", tmp_path / "maps", code=1)
-    assert list(gone["failed"]) == ["a/1"]
+    gone = evaluated(two_scenes / "a", "--predictions", tmp_path / "maps" / "a", code=1)
+    assert list(gone["failed"]) == ["1"]
 
 
 def test_view_sets_may_lie_in_each_scene(two_scenes: Path, evaluated: Evaluated) -> None:

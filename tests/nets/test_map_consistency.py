@@ -70,6 +70,8 @@ def test_places_are_found_where_parallax_puts_them() -> None:
     assert np.array_equal(there, rows * SIZE[1] + columns - 4)
     assert columns.min() == 4
     assert len(here) == SIZE[0] * (SIZE[1] - 4)
+    nearer = np.float32(0.97) * wall
+    assert len(same_places(camera(0), wall, camera(0.25), nearer)[0]) == 0
 
 
 def test_true_maps_agree_as_the_truth_does_and_do_not_flicker(room: PosedImages) -> None:

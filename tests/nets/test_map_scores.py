@@ -57,6 +57,17 @@ def test_what_is_aligned_does_not_depend_on_the_scale_before(
         assert one == pytest.approx(other, rel=1e-3, abs=1e-3)
 
 
+def test_alignments_by_hand() -> None:
+    ones = np.ones((1, 4), np.float32)
+    found = align(ones, np.array([[1.0, 2.0, 6.0, 0.0]], np.float32), "median", depth_range=RANGE)
+    assert found.depth.tolist() == [[2, 2, 2, 2]]
+    # The line falls; where it is below 0 the map keeps a depth, the nearest that counts.
+    falling = np.array([[3.0, 2.0, 0.0]], np.float32)
+    depth = np.array([[1.0, 2.0, 9.0]], np.float32)
+    found = align(depth, falling, "scale-and-shift", depth_range=RANGE)
+    assert found.depth == pytest.approx(np.array([[3, 2, 0.5]]), abs=1e-6)
+
+
 def test_a_flat_map_is_shifted_alone_and_holes_stay_holes() -> None:
     truth = np.array([[2.0, 4.0, 3.0]], np.float32)
     flat = np.array([[1.0, 1.0, 0.0]], np.float32)
