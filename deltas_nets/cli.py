@@ -5,6 +5,7 @@ Nothing heavy is imported before a command runs, so that --help is instant.
 
 import sys
 
+from deltas_nets.commands.ablate import Ablate
 from deltas_nets.commands.calibrate import Calibrate
 from deltas_nets.commands.check import Check
 from deltas_nets.commands.command_line import run
@@ -19,6 +20,7 @@ from deltas_nets.commands.export import Export
 from deltas_nets.commands.fuse import Fuse
 from deltas_nets.commands.page import Page
 from deltas_nets.commands.recipe import Recipe
+from deltas_nets.commands.robustness import Robustness
 from deltas_nets.commands.train import Train
 from deltas_nets.commands.view import View
 
@@ -32,6 +34,8 @@ COMMANDS = (
     Convert,
     Evaluate,
     Detectors,
+    Ablate,
+    Robustness,
     Train,
     Recipe,
     Distill,

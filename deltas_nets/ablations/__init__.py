@@ -1,0 +1,1 @@
+"""One thing changed at a time: settings of a network, and what disturbs it."""
