@@ -71,7 +71,8 @@ def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
 
 def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
     """What :func:`normalize_pixels` gives to pixel (0, 0), and its slope, each ``(2,)``."""
-    if values_at_hand(like):
+    # What a mode of torch makes, as a fake tensor, is not to be kept.
+    if values_at_hand(like) and torch._C._len_torch_dispatch_stack() == 0:
         return _kept_normalizing(*image_size, like.dtype)
     return _normalizing(*image_size, like.device, like.dtype)
 
