@@ -109,6 +109,10 @@ def test_a_masked_point_is_a_point_removed(
     pixels, depth, weights = (value.clone() for value in scene[:3])
     rest = torch.arange(8) != unused
     wanted = rasterize(pixels[rest], depth[rest], weights[rest], kind)
+    for ours, theirs in zip(
+        rasterize(pixels, depth, weights, kind, mask=rest), wanted, strict=True
+    ):
+        assert_close(ours, theirs, rtol=0, atol=1e-12)
     for spoilt, value in ((pixels, torch.nan), (depth, torch.inf), (weights, torch.nan)):
         spoilt[unused] = value
         inputs = [tensor.clone().requires_grad_() for tensor in (pixels, depth, weights)]

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import ShapeError, project, refine_points, reprojection_residual
-from deltas_geom.testing import PosedScene, forward_motion
+from deltas_geom.testing import PosedScene, forward_motion, right_angle
 from deltas_geom.testing.strategies import posed_scenes, vectors
 from deltas_geom.triangulation.refine import Loss
 
@@ -44,6 +44,20 @@ def test_the_cost_never_grows(
     if loss == "squared":
         at_start = reprojection_residual(proj, start, pixels, weights)
         assert (refined.residual <= at_start + 1e-9).all()  # px, rounding
+
+
+def test_a_step_that_would_overshoot_is_not_taken() -> None:
+    scene, count = right_angle(), 500
+    generator = torch.Generator().manual_seed(0)
+    start = scene.points + 3 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    proj, pixels = scene.views.proj, scene.pixels.expand(2, count, 2)
+    refined = refine_points(proj, pixels, start)
+    kept = (refined.points == start).all(dim=-1) & refined.valid
+    assert 10 < kept.sum() < refined.valid.sum()
+    ones = torch.ones(2, count).double()
+    before = reprojection_residual(proj, start, pixels, ones)
+    assert (refined.residual <= before + 1e-9)[refined.valid].all()  # px
+    assert (project(scene.views, refined.points).in_front.all(dim=0) == refined.valid).all()
 
 
 @given(scene=posed_scenes(num_views=3), loss=st.sampled_from(LOSSES))
