@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -159,7 +160,7 @@ class Evaluate(Prediction):
 
         config = self.config()
         scoring = Scoring(self.range, self.truth_size, self.consistency)
-        predictor = None if self.predictions is not None else self.varied_predictor()
+        predictor = None if self.predictions is not None else self.network
 
         def score(
             name: str, capture: Capture, views: SceneViews, meter: CalibrationMeter
@@ -180,9 +181,11 @@ class Evaluate(Prediction):
 
         return score
 
-    def varied_predictor(self) -> "Predictor":
-        """The network, under the settings that are given."""
-        return self.predictor().varied(self.settings)
+    @cached_property
+    def network(self) -> "Predictor":
+        """The network, under the settings that are given; loaded when it is first asked for."""
+        network = self.predictor()
+        return network.varied(self.settings) if self.settings.given() else network
 
     def _of_rooms(self) -> tuple["DatasetScores", str]:
         from deltas_nets.evaluate.dataset import DatasetScores
@@ -201,7 +204,7 @@ class Evaluate(Prediction):
         if not 2 <= views <= 12:
             raise UserError(f"no rooms of {views} views", "--views", "give 2 to 12")
         what = "the reference network has one camera, and rooms have others"
-        model = self.varied_predictor().deltas(what, self.weights, "name a capture")
+        model = self.network.deltas(what, self.weights, "name a capture")
         rooms = held_out_rooms(
             count,
             EVALUATION_SEEDS,
@@ -266,9 +269,8 @@ class Evaluate(Prediction):
         from deltas_nets.outputs.summary import SUMMARY, read_summary
 
         if self.predictions is None:
-            predictor = self.varied_predictor()
-            network = {"network": predictor.network_record()}
-            return {self.weights: network | predictor.weights_record(self.weights)}
+            network = {"network": self.network.network_record()}
+            return {self.weights: network | self.network.weights_record(self.weights)}
         folders = [self.predictions, *(self.predictions / name for name in scores.scenes)]
         summaries = filter(None, (read_summary(folder / SUMMARY) for folder in folders))
         settings = next(summaries, {}).get("settings", {})

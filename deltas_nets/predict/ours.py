@@ -67,7 +67,9 @@ class DeltasPredictor:
     def varied(self, settings: NetworkSettings) -> "DeltasPredictor":
         """The same weights in a network of another config."""
         model = self.encode.model
-        other = Deltas(varied_config(model.config, settings)).to(model.dtype)
+        config = varied_config(model.config, settings)
+        with torch.random.fork_rng(devices=()):  # what it starts from is thrown away
+            other = Deltas(config).to(next(model.parameters()).device, model.dtype)
         other.load_state_dict(model.state_dict(), assign=True)
         asked = settings.num_points
         without = self.without_points if asked is None else asked == 0

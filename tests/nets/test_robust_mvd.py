@@ -1,16 +1,20 @@
 """The benchmark's interface, called as its program calls it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from room_capture import write_scene
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.evaluate.depth_metrics import depth_metrics
 from deltas_nets.evaluate.robust_mvd import RobustMvdModel, robust_mvd_metrics
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.predictor import load_predictor
+from deltas_nets.predict.search import Followed
 from deltas_nets.rooms import render_room
 
 Arrays = list[np.ndarray]
@@ -59,6 +63,20 @@ def test_the_map_is_that_of_the_capture(model: RobustMvdModel, sample: Capture) 
         **given, keyview_idx=np.array([0]), depth_range=(np.array([0.5]), np.array([10.0]))
     )
     assert model(**ranged)["depth"][0, 0] == pytest.approx(expected.depth, rel=2e-3)
+
+
+@pytest.mark.shared
+def test_the_benchmarks_own_sample_is_as_the_capture_of_its_folder(
+    model: RobustMvdModel, shared_data: Path
+) -> None:
+    """A room's corner, 0.5 to 1.2 m away: no range is given, and none of it is missed."""
+    capture = open_capture(shared_data / "formats" / "robustmvd")
+    keys = list(capture.frames).index("key")
+    found = model(**model.input_adapter(**arrays_of(capture), keyview_idx=keys))
+    views = ViewSet("key", capture.sources["key"])  # type: ignore[index]
+    expected = Followed(capture)(load_predictor("deltas-small"), views, PredictConfig()).map
+    assert found["depth"][0, 0] == pytest.approx(expected.depth, rel=1e-3)
+    assert 0.5 < np.median(found["depth"]) < 1.0
 
 
 def test_the_key_view_may_be_any_and_items_of_a_batch_are_alone(

@@ -117,6 +117,17 @@ def test_without_points_the_sources_do_not_matter(capture: Capture, light: Delta
     assert alone.network_record()["without_points"]
 
 
+def test_the_weights_are_shared_and_chance_is_not_touched(light: DeltasPredictor) -> None:
+    torch.manual_seed(3)
+    other = light.varied(NetworkSettings(offset=2)).encode.model
+    expected = torch.rand(1, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(torch.rand(1), expected)
+    model = light.encode.model
+    assert other.config != model.config
+    for mine, theirs in zip(other.parameters(), model.parameters(), strict=True):
+        assert mine.data_ptr() == theirs.data_ptr()
+
+
 def test_what_a_network_lacks_is_named() -> None:
     small = load_predictor("deltas-small")
     with pytest.raises(UserError, match="deltas-small has no such setting, --offset"):
