@@ -126,7 +126,7 @@ def _row(
         network.check_asked(config, measurement.capture, view_sets)
         scores = evaluate_network(network, measurement.capture, view_sets, config, scoring)
     except UserError as error:
-        return head | {"note": str(error)}
+        return head | {"note": f"{error.what}, {error.where}"}
     return head | _figures(scores) | (_cost(predictor) if series.name == "architecture" else {})
 
 

@@ -27,7 +27,7 @@ class Detectors(Command):
     Example: deltas detectors my_capture --detectors orb sift ours aliked=aliked-n16.pth
     """
 
-    capture: tyro.conf.Positional[Path]
+    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
     """Folder with images, poses, intrinsics and depth/N.png; or a text file of image pairs without
     depth, as SuperGlue's evaluation has them, for rotations and directions alone."""
     detectors: tuple[str, ...] = ("orb", "sift", "ours")
