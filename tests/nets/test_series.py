@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference_tables import random_tables
 from run_command import Run, assert_one_line
 from small_capture import write_capture
 
@@ -246,3 +247,17 @@ def test_a_disturbed_network_keeps_its_disturbance_under_other_settings(model: D
     assert other.change is disturbed.change
     unit = InUnit(DeltasPredictor(model), 3.0, told=True).varied(NetworkSettings(num_points=16))
     assert (unit.factor, unit.told) == (3.0, True)
+
+
+def test_the_published_checkpoint_has_the_settings_that_ours_lacks(
+    run: Run, tmp_path: Path
+) -> None:
+    where = write_capture(tmp_path / "walk", 3)
+    file = tmp_path / "checkpoint.pth.tar"
+    torch.save(random_tables(), file)
+    common = [where, "--out", tmp_path / "out", "--sets", 1, "--work-size", 48, 64]
+    result = run("ablate", "offsets", *common, "--weights", file)
+    assert result.code == 0, result.err
+    rows = read_record(tmp_path / "out" / "offsets.json").rows
+    own = [row for row in rows if row["weights"] != "the paper (ScanNet)"]
+    assert [row["step"] for row in own] == ["1", "2"] and all(row["frames"] == 1 for row in own)
