@@ -14,6 +14,7 @@ from torch import Tensor
 from deltas_nets.config import NetworkConfig, from_dict, to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import Network, build_network
 from deltas_nets.outputs.atomic_files import write_atomically
 
 DEFAULT = "deltas-small"
@@ -28,12 +29,25 @@ def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = 
         device: where to put it.
 
     Raises:
-        UserError: no such network or file, or the file holds something else.
+        UserError: no such network or file, or the file holds something else, such as a network
+            without points.
 
     Example:
         >>> load_model().config.name
         'deltas-small'
     """
+    network = load_network(name_or_file, device)
+    if isinstance(network, Deltas):
+        return network
+    raise UserError(
+        f"{network.config.name} has no points, and none of the stages wanted here",
+        weights_file(name_or_file),
+        f"name weights of a deltas network ({DEFAULT})",
+    )
+
+
+def load_network(name_or_file: str | Path, device: str | torch.device = "cpu") -> Network:
+    """A trained network of any kind that `deltas train` trains; arguments as of `load_model`."""
     file = weights_file(name_or_file)
     metadata = read_metadata(file)
     if "network" not in metadata:
@@ -44,7 +58,7 @@ def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = 
         raise UserError(
             f"weights of another version ({error})", file, "train again or install that version"
         ) from None
-    model = Deltas(config)
+    model = build_network(config)
     load_weights(model, file)
     return model.to(device).eval()
 
@@ -143,7 +157,7 @@ def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
         ) from None
 
 
-def save_weights(file: Path, model: Deltas, metadata: Mapping[str, str]) -> None:
+def save_weights(file: Path, model: Network, metadata: Mapping[str, str]) -> None:
     """Write weights and where they come from, atomically.
 
     Args:

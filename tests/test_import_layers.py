@@ -18,8 +18,8 @@ ABOVE = {
     ),
     "deltas_nets": (
         "errors terminal config captures network check outputs weights_file losses reference rooms "
-        "datasets cost fuse agree predict distill evaluate ablations page view teachers export "
-        "train commands cli"
+        "datasets cost fuse agree predict baselines distill evaluate ablations page view teachers "
+        "export train commands cli"
     ),
 }
 ORDER = {package: names.split() for package, names in ABOVE.items()}

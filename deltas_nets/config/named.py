@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from deltas_nets.config.losses import PAPER_LOSS
+from deltas_nets.config.losses import PAPER_LOSS, LossConfig
 from deltas_nets.config.network import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.config.training import DataConfig, TrainConfig
 
@@ -28,8 +28,14 @@ CONFIGS: dict[str, NetworkConfig] = {
         head_width=128,
         densifier_widths=(96, 64, 32, 16, 8),
     ),
+    "cost-volume": NetworkConfig(
+        name="cost-volume",
+        matcher=MatcherConfig(kind="volume"),
+        densifier_widths=(64, 96, 128, 160),
+    ),
 }
-"""Networks by name; the second is the paper's, the third the light one of its supplement."""
+"""Networks by name; the second is the paper's, the third the light one of its supplement, the last
+one of another kind to measure beside them."""
 
 
 def _as_in_the_paper(name: str) -> TrainConfig:
@@ -56,6 +62,11 @@ TRAIN_CONFIGS: dict[str, TrainConfig] = {
     "deltas-small": TrainConfig(),
     "deltas-resnet50": _as_in_the_paper("deltas-resnet50"),
     "deltas-vgg9": _as_in_the_paper("deltas-vgg9"),
+    "cost-volume": TrainConfig(
+        network=CONFIGS["cost-volume"],
+        # It has no points, and learns from the dense map alone.
+        loss=LossConfig(detector=0, match=0, point=0, posterior=0, confidence=0),
+    ),
 }
 """Training by network. The paper's have its five losses, and a little of the likelihood that
 teaches the dense map's spread."""

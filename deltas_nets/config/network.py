@@ -37,10 +37,12 @@ class DetectorConfig:
 class MatcherConfig:
     """How keypoints find their depth in the sources."""
 
-    kind: Literal["joint", "per_view"] = "joint"
-    """joint fuses all views at common inverse depths; per_view decides in each, as the paper."""
+    kind: Literal["joint", "per_view", "volume"] = "joint"
+    """joint fuses all views at common inverse depths; per_view decides in each, as the paper.
+    volume has no keypoints: it compares every pixel at every depth, as MVDepthNet."""
     num_samples: int = 64
-    """per_view: samples along a segment (the paper: 100); joint: bins of inverse depth."""
+    """per_view: samples along a segment (the paper: 100); joint: bins of inverse depth; volume:
+    planes."""
     offsets: tuple[float, ...] = (-1.0, 0.0, 1.0)
     """per_view: parallel lines searched besides the epipolar line, pixels."""
     step: float = 1.5
@@ -98,7 +100,8 @@ class NetworkConfig:
                 f"{self.densifier_widths}"
             )
         check_at_least(1, self, "descriptor_dim", "head_width", "densifier_widths")
-        if not lite and self.matcher.kind == "joint":
-            raise ValueError(f"the joint matcher needs the lite backbone, got {self.backbone}")
+        if not lite and self.matcher.kind != "per_view":
+            kind = self.matcher.kind
+            raise ValueError(f"the {kind} matcher needs the lite backbone, got {self.backbone}")
         if not lite and self.descriptor_stride != 2:
             raise ValueError(f"descriptor_stride is of the lite backbone, got {self.backbone}")

@@ -11,19 +11,22 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.config.baselines import BASELINES
+from deltas_nets.config.lookup import look_up
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.predict.dense import DensePredictor
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.reference import ReferencePredictor
-from deltas_nets.weights_file import load_model, weights_file
+from deltas_nets.weights_file import load_network, weights_file
 
 Precision = Literal["float32", "bfloat16"]
 
 
 class Predictor(Protocol):
-    """A network of deltas, or the reference network, as commands see it."""
+    """A network of deltas, the reference network or a baseline, as commands see it."""
 
     @property
     def states_confidence(self) -> bool:
@@ -88,7 +91,8 @@ def load_predictor(
     *,
     precision: Precision = "float32",
 ) -> Predictor:
-    """The network of a shipped name, of a file of `deltas train`, or of the published checkpoint.
+    """The network of a shipped name, of a file of `deltas train`, or of the published checkpoint;
+    or the baseline of a name.
 
     Args:
         name_or_file: what the file holds is read from it, not from its name.
@@ -103,11 +107,13 @@ def load_predictor(
         >>> load_predictor("deltas-small").network_record()["name"]
         'deltas-small'
     """
+    if name_or_file in BASELINES:
+        _check_float32(precision, str(name_or_file))
+        baseline: Predictor = look_up("deltas_nets.baselines", BASELINES[str(name_or_file)])(device)
+        return baseline
     file = weights_file(name_or_file)
     if reference.is_published(file):
-        if precision != "float32":
-            what = "the reference network runs in float32 alone"
-            raise UserError(what, f"--precision {precision}", "leave it out")
+        _check_float32(precision, "the reference network")
         return ReferencePredictor(reference.load(file, device=device))
     if not _is_safetensors(file):
         raise UserError(
@@ -115,8 +121,16 @@ def load_predictor(
             file,
             "name a weights.safetensors, or the file that the authors of the paper published",
         )
-    model = load_model(name_or_file, device)
-    return DeltasPredictor(model.bfloat16() if precision == "bfloat16" else model)
+    model = load_network(name_or_file, device)
+    model = model.bfloat16() if precision == "bfloat16" else model
+    return DeltasPredictor(model) if isinstance(model, Deltas) else DensePredictor(model)
+
+
+def _check_float32(precision: Precision, name: str) -> None:
+    """Refuse any other."""
+    if precision != "float32":
+        what = f"{name} runs in float32 alone"
+        raise UserError(what, f"--precision {precision}", "leave it out")
 
 
 def _is_safetensors(file: Path) -> bool:

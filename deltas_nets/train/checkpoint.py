@@ -13,7 +13,7 @@ import torch
 from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
 from deltas_nets.distill.teachers import LICENCES
 from deltas_nets.errors import UserError
-from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import Network
 from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.weights_file import save_weights
@@ -24,7 +24,7 @@ CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetenso
 class RunState(NamedTuple):
     """What a run continues from."""
 
-    model: Deltas
+    model: Network
     average: RunningAverage
     optimizer: torch.optim.Optimizer
     step: int
@@ -41,7 +41,7 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str)
     """
     write_json(folder / CONFIG, to_dict(config))
     average = state.average.model
-    assert isinstance(average, Deltas)
+    assert isinstance(average, Network)
     public = without_paths(config)
     data, licence = _data_and_licence(public)
     metadata = {

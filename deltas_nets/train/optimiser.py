@@ -4,10 +4,10 @@ import torch
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.config.schedule import rate_factor
-from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import Network
 
 
-def make_optimizer(model: Deltas, config: TrainConfig) -> torch.optim.Optimizer:
+def make_optimizer(model: Network, config: TrainConfig) -> torch.optim.Optimizer:
     """AdamW; the pretrained encoder learns at a share of the rate."""
     pretrained = model.encoder.pretrained_parameters()
     known = {id(parameter) for parameter in pretrained}

@@ -12,7 +12,7 @@ from deltas_nets.config import TrainConfig
 from deltas_nets.distill.supervision import TeacherLabels
 from deltas_nets.distill.teachers import load_teacher
 from deltas_nets.errors import UserError
-from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import build_network
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batch_norm import prepare_batch_norm
 from deltas_nets.train.checkpoint import RunState, load_run
@@ -84,7 +84,7 @@ def starting_state(
         check_continues(folder, config)
     teacher = _teacher(config, start)  # first: nothing has been computed yet
     torch.manual_seed(config.seed)
-    model = Deltas(config.network)
+    model = build_network(config.network)
     origin = "random weights"
     if start.encoder is not None:
         model.encoder.load_pretrained(start.encoder)

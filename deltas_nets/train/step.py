@@ -19,7 +19,7 @@ from deltas_nets.losses.divisors import (
     KnownDivisors,
 )
 from deltas_nets.losses.losses import Losses, training_losses
-from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import Network
 from deltas_nets.train.batch_norm import Statistics
 from deltas_nets.train.batches import Batch
 
@@ -33,11 +33,11 @@ class Objective(nn.Module):
     """A network and its losses as one module, so that nothing but losses leaves DDP.
 
     Args:
-        model: its forward is that of :class:`Deltas`.
+        model: its forward is that of :class:`deltas_nets.network.deltas.Deltas`.
         config: of the run.
     """
 
-    def __init__(self, model: Deltas, config: TrainConfig) -> None:
+    def __init__(self, model: Network, config: TrainConfig) -> None:
         super().__init__()
         self.model = model
         self.config = config
@@ -180,7 +180,7 @@ class Stepper:
         return total
 
 
-def unreached(model: Deltas, config: TrainConfig) -> list[str]:
+def unreached(model: Network, config: TrainConfig) -> list[str]:
     """Parameters that no loss depends on, for whose gradients DDP would wait in vain.
 
     They follow from the config alone, not from the number of views or what they show.

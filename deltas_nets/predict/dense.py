@@ -1,0 +1,82 @@
+"""A cost-volume network makes a depth map of posed frames: no points, but a deviation."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from deltas_geom import PosedViews
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.measured import MeasuredDepth
+from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.work_size import load_views
+from deltas_nets.config import to_dict
+from deltas_nets.config.varied import NetworkSettings
+from deltas_nets.errors import UserError
+from deltas_nets.network.cost_volume.network import CostVolume
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.predict.depth_map import (
+    DepthMap,
+    PredictConfig,
+    finished_map,
+    keypoint_depths,
+)
+from deltas_nets.predict.ours import work_size_of
+from deltas_nets.weights_file import weights_record
+
+
+class DensePredictor:
+    """A cost-volume network; see :class:`deltas_nets.predict.predictor.Predictor`.
+
+    Args:
+        model: trained, on any device.
+    """
+
+    states_confidence = True
+
+    def __init__(self, model: CostVolume) -> None:
+        self.model = model
+
+    def check_asked(
+        self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
+    ) -> None:
+        """It can do all of it."""
+
+    def varied(self, settings: NetworkSettings) -> "DensePredictor":
+        """It has no points that settings could be of."""
+        settings.check_known(self.model.config.name)
+        return self
+
+    @torch.inference_mode()
+    def depth_map(
+        self,
+        frames: Sequence[Frame],
+        config: PredictConfig,
+        measured: MeasuredDepth | None = None,
+    ) -> DepthMap:
+        """Depth of the first frame from all of them; it takes no measured depth."""
+        if measured is not None or len(frames) == 1:
+            what = (
+                f"{self.model.config.name} takes no measured depth, and looks at two views or more"
+            )
+            raise UserError(what, "--sensor-depth", "leave it out")
+        device = next(self.model.parameters()).device
+        images, views = load_views(frames, work_size=work_size_of(frames[0], config))
+        of_device = PosedViews(*(part.to(device) for part in views))
+        found = self.model(images.to(device), of_device, config.depth_range)
+        work = KnownDepth(found.depth, found.std / found.depth)
+        return finished_map(frames[0], work, keypoint_depths(found), config)
+
+    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
+        """It is none."""
+        raise UserError(refusal, where, remedy)
+
+    def network_record(self) -> dict[str, Any]:
+        """Its config."""
+        return to_dict(self.model.config)
+
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """What the weights file says of itself."""
+        return weights_record(name_or_file)
