@@ -199,6 +199,11 @@ def check(name: str, batch: Inputs, *, gradients: bool) -> Fields:
         assert torch.equal(valid, found["status"] == Status.OK)
         assert (found["points"][~valid] == 0).all() and (found["depth"].mT[~valid] == 0).all()
         assert (found["parallax"] >= 0).all() and (found["parallax"] <= 3.1416).all()
+        # In front of every view that is surely used is what OK says.
+        weights = given_to(solver, batch)[2]
+        used = weights > 2 * NEGLIGIBLE_WEIGHT * weights.amax(dim=-2, keepdim=True)
+        ahead = (found["depth"] >= 0) | ~used | ~valid.unsqueeze(-2)
+        assert robust or ahead.all()
         check_inliers(solver, batch, found) if robust else check_status(
             solver, batch, found["status"]
         )
