@@ -24,7 +24,6 @@ COLUMNS = {
     "abs_diff": "Abs",
     "sq_rel": "SqRel",
     "delta1": "d1",
-    "delta2": "d2",
     "sparse_abs_rel": "points",
     "sparse_delta1": "d1",
     "gmacs": "GMACs",
@@ -49,7 +48,7 @@ def _table(series: Series, rows: Sequence[Mapping[str, Any]], weights: str) -> T
     for heading in shown.values():
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
-        figures = ("-" if row.get(key) is None else f"{row[key]:.4f}" for key in shown)
+        figures = ("-" if row.get(key) is None else _figure(key, row[key]) for key in shown)
         table.add_row(str(row["step"]), *figures)
     return table
 
@@ -114,6 +113,9 @@ def draw_series(path: Path, series: Series, rows: Sequence[Mapping[str, Any]]) -
     for axis, key, label in zip(
         axes, ("abs_rel", "delta1"), ("Abs Rel", "share within 1.25"), strict=True
     ):
+        if not series.axis:
+            _draw_bars(axis, measured, key, label)
+            continue
         for weights in dict.fromkeys(str(row["weights"]) for row in measured):
             own = [row for row in measured if row["weights"] == weights]
             _draw(axis, own, key, weights, series)
@@ -122,6 +124,20 @@ def draw_series(path: Path, series: Series, rows: Sequence[Mapping[str, Any]]) -
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(fontsize="small")
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=120))
+
+
+def _figure(key: str, value: float) -> str:
+    return f"{value:.1f}" if key == "gmacs" else f"{value:.4f}"
+
+
+def _draw_bars(axis: Any, rows: Sequence[Mapping[str, Any]], key: str, label: str) -> None:
+    """Values that belong to no axis, the first one on top."""
+    names = [f"{row['weights']}\n{row['step']}".strip() for row in rows]
+    colors = ["tab:orange" if row["weights"] == ON_SCANNET else "tab:blue" for row in rows]
+    axis.barh(names, [row[key] for row in rows], color=colors)
+    axis.invert_yaxis()
+    axis.tick_params(labelsize=7)
+    axis.set_xlabel(label)
 
 
 def _draw(
@@ -134,7 +150,7 @@ def _draw(
     if placed:
         x = [row[x_key] for row in placed]
         joined = style if x_key == "value" else "none"
-        axis.plot(x, [row[key] for row in placed], joined, marker="o", ms=4, label=weights)
+        axis.plot(x, [row[key] for row in placed], ls=joined, marker="o", ms=4, label=weights)
         axis.set_xlabel(series.axis)
         if series.logarithmic:
             axis.set_xscale("log")

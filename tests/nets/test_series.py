@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from reference_tables import random_tables
 from run_command import Run, assert_one_line
 from small_capture import write_capture
@@ -18,6 +19,7 @@ from deltas_nets.ablations.curves import CURVES, curve
 from deltas_nets.ablations.disturbed import Disturbed, InUnit
 from deltas_nets.ablations.journal import Journal, key_of
 from deltas_nets.ablations.paper import PAPER, SPARSE_RATIO
+from deltas_nets.ablations.report import draw_series, with_paper
 from deltas_nets.ablations.steps import Series, Step
 from deltas_nets.ablations.tables import TABLES
 from deltas_nets.captures.capture import Capture
@@ -261,3 +263,17 @@ def test_the_published_checkpoint_has_the_settings_that_ours_lacks(
     rows = read_record(tmp_path / "out" / "offsets.json").rows
     own = [row for row in rows if row["weights"] != "the paper (ScanNet)"]
     assert [row["step"] for row in own] == ["1", "2"] and all(row["frames"] == 1 for row in own)
+
+
+def test_a_figure_has_a_mark_for_every_row_that_was_measured(tmp_path: Path) -> None:
+    for name in ("points", "architecture", "sparse"):
+        series = TABLES[name]
+        rows = with_paper(series, [])
+        draw_series(tmp_path / "all.png", series, rows)
+        draw_series(tmp_path / "none.png", series, [])
+        pictures = [
+            np.asarray(Image.open(tmp_path / f"{n}.png").convert("RGB")) for n in ("all", "none")
+        ]
+        # Orange and blue are the colours of marks and bars.
+        coloured = [np.ptp(picture.astype(int), axis=-1) > 100 for picture in pictures]
+        assert coloured[0].sum() > 150 and coloured[1].sum() == 0
