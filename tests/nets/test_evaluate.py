@@ -12,6 +12,7 @@ from PIL import Image
 from run_command import Result, Run, assert_one_line
 from small_capture import write_capture
 
+from deltas_nets.commands.evaluate import Evaluate
 from deltas_nets.evaluate.record import read_record
 from deltas_nets.evaluate.scenes import named_scenes, scenes_in
 from deltas_nets.rooms import render_room
@@ -98,6 +99,19 @@ def test_what_is_written_says_what_made_it(two_scenes: Path, evaluated: Evaluate
     assert {"processor", "threads"} <= record.machine.keys()
     assert record.command.startswith("deltas evaluate a --views 2")
     assert list(record.data) == [{"name": "a", "view_sets": 3}]
+
+
+def test_files_are_there_whatever_becomes_of_what_is_printed(
+    two_scenes: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Evaluate, "_print", gone)
+    files = ["--json", tmp_path / "a.json", "--csv", tmp_path / "a.csv"]
+    assert run("evaluate", two_scenes / "b", *QUICK, *files).code == 130
+    assert (tmp_path / "a.json").exists()
+    assert (tmp_path / "a.csv").exists()
 
 
 def test_scenes_are_found_in_folders_and_lists(two_scenes: Path, tmp_path: Path) -> None:

@@ -123,15 +123,18 @@ def test_without_parallax_the_match_is_pixel_zero() -> None:
     assert_close(matches.weights, torch.full((1, 1, 1), 0.0005))
 
 
-def test_a_match_across_the_line_is_halved() -> None:
+@pytest.mark.parametrize("offset", [1.0, 2.0])
+@pytest.mark.parametrize("count", [25, 100])
+def test_a_match_across_the_line_is_halved(offset: float, count: int) -> None:
     found = reference_segments(
         torch.tensor([[[31.0, 20.0]]]), K, moved(-0.15, 0, 0), image_size=SIZE
     )
-    samples = segment_samples(found)
-    scores = torch.zeros(1, 1, 1, 3, 100)
-    scores[..., 2, 30] = 1000
-    match = read_matches(scores, found).pixels[0, 0, 0]
-    sampled = samples[0, 0, 0, 2, 30]
+    samples = segment_samples(found, num_samples=count, offset=offset)
+    scores = torch.zeros(1, 1, 1, 3, count)
+    scores[..., 2, 20] = 1000
+    match = read_matches(scores, found, offset=offset).pixels[0, 0, 0]
+    sampled = samples[0, 0, 0, 2, 20]
+    assert abs(sampled[1] - 20) == offset
     assert_close(match[0], sampled[0])
     assert_close(match[1] - 20, (sampled[1] - 20) / 2)
     assert_close(read_matches(scores, found).weights, torch.full((1, 1, 1), 1.001))
