@@ -43,9 +43,8 @@ class SweepConfig:
     """Grey values, 0 to 1, vary as much by noise alone."""
     penalties: Penalties = _PENALTIES
     """Of changes of depth, beside costs within 0 to 1."""
-    margin: float = 0.05
-    """A pixel counts as a point where the best plane costs so much less than all others, a path.
-    How much less it costs is its weight in the map."""
+    least_similarity: float = 0.8
+    """A pixel counts as a point where anchor and sources are so alike at the plane that won."""
     smoothing: Smoothing = _SMOOTHING
     """How far pixels of more weight reach into those of less."""
 
@@ -55,7 +54,7 @@ class SweepDepth(NamedTuple):
 
     Attributes:
         depth: ``(H, W)`` everywhere, metres.
-        believed: ``(H, W)`` bool: where one plane is clearly better than the others.
+        believed: ``(H, W)`` bool: where anchor and sources are alike at this depth.
     """
 
     depth: Tensor
@@ -125,9 +124,12 @@ def plane_sweep(
     guide = grey[0, 0]
     best = winner(aggregate((1 - similar) / 2, guide, config.penalties) / 8)
     inverse = inv_depths[0] + best.place * (inv_depths[1] - inv_depths[0])
+    # Where another plane is as good, neighbours know better.
     dense = filled(inverse, best.margin.clamp_min(0), guide, config.smoothing)
     depth = 1 / dense.clamp(inv_depths[0], inv_depths[-1])
-    return SweepDepth(depth, best.margin > config.margin)
+    nearest = best.place.round().long().clamp(0, config.planes - 1)
+    alike = similar.gather(0, nearest[None])[0]
+    return SweepDepth(depth, alike > config.least_similarity)
 
 
 def size_of_sweep(image_size: tuple[int, int]) -> tuple[int, int]:
