@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torch import nn
+
 from deltas_nets.ablations.journal import Journal, key_of
 from deltas_nets.ablations.steps import Series, Step
 from deltas_nets.captures.capture import Capture
@@ -15,9 +17,11 @@ from deltas_nets.errors import UserError
 from deltas_nets.evaluate.capture import Scoring, evaluate_network
 from deltas_nets.evaluate.results import METRICS_VERSION
 from deltas_nets.evaluate.scores import CaptureScores
-from deltas_nets.network.deltas import Deltas
+from deltas_nets.predict.dense import DensePredictor
 from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.predictor import Predictor, load_predictor
+from deltas_nets.predict.reference import ReferencePredictor
 
 __all__ = ["Measured", "Measurement", "measure"]
 
@@ -140,13 +144,20 @@ def _figures(scores: CaptureScores) -> dict[str, Any]:
 
 
 def _cost(predictor: Predictor) -> dict[str, Any]:
-    """Of a network of ours at the paper's setting; others are in `deltas cost`."""
-    try:
-        model: Deltas = predictor.deltas("no network of ours", "architecture", "see deltas cost")
-    except UserError:
+    """Of a network at the paper's setting; nothing of a method that is none."""
+    network = _network_of(predictor)
+    if network is None:
         return {}
-    cost = cost_of(model, PAPER_VIEWS, PAPER_SIZE, PAPER_POINTS, repeats=1).total
+    cost = cost_of(network, PAPER_VIEWS, PAPER_SIZE, PAPER_POINTS, repeats=1).total
     return {"gmacs": gmacs(cost.flops.products), "parameters": cost.parameters}
+
+
+def _network_of(predictor: Predictor) -> nn.Module | None:
+    if isinstance(predictor, DeltasPredictor):
+        return predictor.encode.model
+    if isinstance(predictor, ReferencePredictor):
+        return predictor.network
+    return predictor.model if isinstance(predictor, DensePredictor) else None
 
 
 def _shown(name: str) -> str:

@@ -252,7 +252,7 @@ def test_a_disturbed_network_keeps_its_disturbance_under_other_settings(model: D
 
 
 def test_the_published_checkpoint_has_the_settings_that_ours_lacks(
-    run: Run, tmp_path: Path
+    run: Run, tmp_path: Path, weights: Path
 ) -> None:
     where = write_capture(tmp_path / "walk", 3)
     file = tmp_path / "checkpoint.pth.tar"
@@ -263,6 +263,9 @@ def test_the_published_checkpoint_has_the_settings_that_ours_lacks(
     rows = read_record(tmp_path / "out" / "offsets.json").rows
     own = [row for row in rows if row["weights"] != "the paper (ScanNet)"]
     assert [row["step"] for row in own] == ["1", "2"] and all(row["frames"] == 1 for row in own)
+    assert run("ablate", "architecture", *common, "--weights", weights).code == 0
+    row = read_record(tmp_path / "out" / "architecture.json").rows[0]
+    assert 2 < row["gmacs"] < 8 and row["parameters"] > 1e6
 
 
 def test_a_figure_has_a_mark_for_every_row_that_was_measured(tmp_path: Path) -> None:
