@@ -18,12 +18,12 @@ SIZE = (24, 32)
 
 @pytest.fixture(scope="module")
 def room() -> PosedImages:
-    return render_room(0, num_views=4, image_size=(96, 128))
+    return render_room(0, num_views=4, image_size=(48, 64))
 
 
 def frame(room: PosedImages, id: int) -> Frame:
     K, pose = (part[id].double().numpy() for part in room.views)
-    return Frame(str(id), None, (96, 128), K, pose)  # type: ignore[arg-type]
+    return Frame(str(id), None, (48, 64), K, pose)  # type: ignore[arg-type]
 
 
 def seen(room: PosedImages, scales: list[float], lens: Lens | None = None) -> SeenMaps:
