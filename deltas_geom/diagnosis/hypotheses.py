@@ -63,25 +63,29 @@ def resized(K: Tensor, factor: float) -> Tensor:
 
 
 def of_all(K: Tensor, pose: Tensor, evidence: Evidence) -> Iterator[Hypothesis]:
-    """Causes that concern all cameras, and exchanged views."""
-    for cause, mend in MENDS.items():
-        yield Hypothesis(cause, (), None, *mend(K, pose))
-    size = best_size(K, pose, evidence)
-    yield Hypothesis(Cause.K_OF_OTHER_SIZE, (), size, resized(K, size), pose)
+    """Causes that concern all cameras."""
+    yield from _of(K, pose, evidence, slice(None))
     for shift in (-0.5, 0.5):
         yield Hypothesis(Cause.HALF_A_PIXEL, (), shift, shifted(K, -shift), pose)
 
 
 def of_one(K: Tensor, pose: Tensor, evidence: Evidence, camera: int) -> Iterator[Hypothesis]:
     """Causes that concern one camera alone; ``evidence`` is that of its pairs."""
-    for cause, mend in MENDS.items():
-        mended = mend(K[[camera]], pose[[camera]])
-        yield Hypothesis(cause, (camera,), None, *replaced(K, pose, camera, *mended))
-    size = best_size(K, pose, evidence, camera)
-    other = replaced(K, pose, camera, resized(K[[camera]], size), pose[[camera]])
-    yield Hypothesis(Cause.K_OF_OTHER_SIZE, (camera,), size, *other)
+    yield from _of(K, pose, evidence, slice(camera, camera + 1), camera)
     unit = best_unit(K, pose, evidence, camera)
     yield Hypothesis(Cause.UNIT_OF_TRANSLATION, (camera,), unit, K, with_unit(pose, camera, unit))
+
+
+def _of(
+    K: Tensor, pose: Tensor, evidence: Evidence, chosen: slice, *cameras: int
+) -> Iterator[Hypothesis]:
+    """Causes that may concern all cameras or one."""
+    for cause, mend in MENDS.items():
+        mended = mend(K[chosen], pose[chosen])
+        yield Hypothesis(cause, cameras, None, *replaced(K, pose, chosen, *mended))
+    size = best_size(K, pose, evidence, chosen)
+    other = replaced(K, pose, chosen, resized(K[chosen], size), pose[chosen])
+    yield Hypothesis(Cause.K_OF_OTHER_SIZE, cameras, size, *other)
 
 
 def exchanged(K: Tensor, pose: Tensor, one: int, other: int) -> Hypothesis:
@@ -91,14 +95,12 @@ def exchanged(K: Tensor, pose: Tensor, one: int, other: int) -> Hypothesis:
     return Hypothesis(Cause.VIEWS_SWAPPED, (one, other), None, K[order], pose[order])
 
 
-def best_size(K: Tensor, pose: Tensor, evidence: Evidence, camera: int | None = None) -> float:
-    """Factor of K, of all cameras or of one, with the least residuals."""
-    chosen = slice(None) if camera is None else slice(camera, camera + 1)
+def best_size(K: Tensor, pose: Tensor, evidence: Evidence, chosen: slice) -> float:
+    """Factor of the chosen cameras' K with the least residuals."""
 
     def cost(factor: float) -> float:
-        changed = K.clone()
-        changed[chosen] = resized(K[chosen], factor)
-        return float(residuals(evidence, changed, pose).mean())
+        changed = replaced(K, pose, chosen, resized(K[chosen], factor), pose[chosen])
+        return float(residuals(evidence, *changed).mean())
 
     return _searched(cost, _SIZES, COMMON_SIZES, step=2 ** (1 / 8))
 
@@ -142,11 +144,11 @@ def shifted(K: Tensor, shift: float) -> Tensor:
 
 
 def replaced(
-    K: Tensor, pose: Tensor, camera: int, one_K: Tensor, one_pose: Tensor
+    K: Tensor, pose: Tensor, chosen: slice, new_K: Tensor, new_pose: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """All cameras with one replaced."""
+    """All cameras with the chosen ones replaced."""
     K, pose = K.clone(), pose.clone()
-    K[camera], pose[camera] = one_K[0], one_pose[0]
+    K[chosen], pose[chosen] = new_K, new_pose
     return K, pose
 
 

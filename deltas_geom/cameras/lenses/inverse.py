@@ -18,6 +18,7 @@ from deltas_geom.cameras.lenses.terms import (
     image_radius,
 )
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
+from deltas_geom.numerics.vectors import either
 
 _PLAIN, _POLISH, _BRACKETED, _CAREFUL = 4, 3, 60, 20
 _FOLLOWED = 2
@@ -54,7 +55,8 @@ def undistort(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted
     lost = ~first.found & (torch.addcmul(u * u, v, v) <= image_radius(terms, within).square())
     if not values_at_hand(first.found):
         again = _solve_safely(terms, u, v, within)
-        return _either(first, again)
+        x, y = either(first.found, first[:2], again[:2])
+        return Undistorted(x, y, first.found | again.found)
     # Not again what is found: what is not may be few.
     few_terms = Terms(*(tuple(c.expand(lost.shape)[lost] for c in part) for part in terms))
     few = (each.expand(lost.shape)[lost] for each in (u, v, within))
@@ -75,12 +77,6 @@ def follow(terms: Terms, point: Undistorted, u: Tensor, v: Tensor) -> Pair:
         dx, dy = _newton(terms, x, y, u, v)
         x, y = x - dx, y - dy
     return x, y
-
-
-def _either(first: Undistorted, second: Undistorted) -> Undistorted:
-    x = torch.where(first.found, first.x, second.x)
-    y = torch.where(first.found, first.y, second.y)
-    return Undistorted(x, y, first.found | second.found)
 
 
 def _plain_scale(terms: Terms, u: Tensor, v: Tensor) -> Tensor:
