@@ -141,7 +141,7 @@ def _depth_range(_: int) -> Series:
         Step(f"{near:g} to {far:g} m", far / near, search=(near, far)) for near, far in _RANGES
     )
     title = "range of depth that is searched; the truth that is scored stays"
-    return Series("depth-range", title, "far over near", tuple(steps), logarithmic=True)
+    return Series("depth-range", title, "", tuple(steps))
 
 
 _MAKERS: dict[str, Callable[[int], Series]] = {

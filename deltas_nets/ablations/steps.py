@@ -49,7 +49,7 @@ class Series:
     title: str
     """What is changed, for a person."""
     axis: str
-    """What the values are, with their unit."""
+    """What the values are, with their unit; empty where steps lie on no axis."""
     steps: tuple[Step, ...]
     logarithmic: bool = False
     """Whether the axis is."""
