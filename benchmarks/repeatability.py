@@ -4,8 +4,9 @@ python benchmarks/repeatability.py --capture DIR [--view-sets FILE] [--weights F
     [--teachers aliked=FILE ...]
 
 Every anchor of the view sets is compared with each of its sources, at the size that the network
-works at. `deltas detectors` has the whole of the paper's table 1; this has Shi-Tomasi and
-ORB by itself besides. The row "spread" is even coverage that has not looked at the image: what chance gives.
+works at. `deltas detectors` has the whole of the paper's table 1; this has Shi-Tomasi and ORB by
+itself besides. The row "spread" is even coverage that has not looked at the image: what chance
+gives.
 """
 
 from collections.abc import Callable
