@@ -3,8 +3,9 @@
     python benchmarks/cost_volume.py --cache DIR --weights DIR [--steps 400] [--results FILE]
 
 `deltas-small` and `cost-volume` are trained from a pretrained encoder by the budget of
-benchmarks/ablations.py and scored on rooms that no training uses, and each by its own losses. Both
-weights files stay in --weights, for `deltas evaluate CAPTURE --weights FILE`.
+benchmarks/ablations.py, each by its own losses, and scored on rooms that no training uses. Both
+weights files stay in --weights, for `deltas evaluate CAPTURE --weights FILE`; the same command goes
+on with a run that was stopped.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from deltas_nets.evaluate.rooms import score_rooms
 from deltas_nets.train.fit import fit
 from deltas_nets.train.start import Start
 from deltas_nets.train.step import DEPTH_RANGE
-from deltas_nets.weights_file import load_network
+from deltas_nets.weights_file import load_network, read_metadata
 
 NETWORKS = ("deltas-small", "cost-volume")
 
@@ -46,13 +47,16 @@ def trained(name: str, shared: TrainConfig, folder: Path) -> dict[str, float]:
     """Train one, unless its weights are there; what it took."""
     finished = folder / "seconds.json"
     if not finished.exists():
-        began, wall = time.process_time(), time.perf_counter()
-        encoder = encoder_file("pretrained", "lite")
-        fit(training(name, shared), folder, Start(encoder), checkpoint_every=100)
-        took = {
-            "cpu_seconds_per_step": (time.process_time() - began) / shared.steps,
-            "seconds_per_step": (time.perf_counter() - wall) / shared.steps,
-        }
+        start, done = Start(encoder_file("pretrained", "lite")), 0
+        if (folder / "checkpoint.pt").exists():
+            start, done = (
+                Start(resume=True),
+                int(read_metadata(folder / "weights.safetensors")["step"]),
+            )
+        began = time.process_time()
+        fit(training(name, shared), folder, start, checkpoint_every=50)
+        # Of the processor: what else the machine is doing must not look like a network's cost.
+        took = {"cpu_seconds_per_step": (time.process_time() - began) / max(1, shared.steps - done)}
         finished.write_text(json.dumps(took))
     read: dict[str, float] = json.loads(finished.read_text())
     return read

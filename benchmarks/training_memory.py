@@ -14,7 +14,7 @@ import torch
 from deltas_geom import PosedViews
 from deltas_nets.config import CONFIGS, PAPER_LOSS
 from deltas_nets.losses.losses import training_losses
-from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import build_network
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
     device = torch.device(arguments.device)
 
     torch.manual_seed(0)
-    model = Deltas(CONFIGS[arguments.network]).train().to(device)
+    model = build_network(CONFIGS[arguments.network]).train().to(device)
     K = torch.tensor([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]).expand(batch, views, 3, 3)
     pose = torch.eye(4).repeat(batch, views, 1, 1)
     pose[..., 0, 3] = -0.1 * torch.arange(views)

@@ -10,7 +10,7 @@ from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import CONFIGS
 
-Measured = Literal[Network, "reference"]
+Measured = Literal[Network, "cost-volume", "reference"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Cost(Command):
         """Run the command."""
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.cost.command import run_cost
-        from deltas_nets.network.deltas import Deltas
+        from deltas_nets.network.networks import build_network
         from deltas_nets.outputs.atomic_files import check_writable
         from deltas_nets.reference import ReferenceNetwork
 
@@ -50,7 +50,7 @@ class Cost(Command):
             check_writable(self.json.parent)
         device = usable_device(self.device)
         networks = {
-            name: ReferenceNetwork() if name == "reference" else Deltas(CONFIGS[name])
+            name: ReferenceNetwork() if name == "reference" else build_network(CONFIGS[name])
             for name in self.networks
         }
         run_cost(

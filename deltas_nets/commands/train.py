@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -15,6 +15,9 @@ from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
 from deltas_nets.config.encoders import ENCODERS
 from deltas_nets.errors import UserError
+
+Preset = Literal[Network, "cost-volume"]
+PRESETS: tuple[Preset, ...] = (*NETWORKS, "cost-volume")
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,10 @@ class Train(Command):
 
     out: Path
     """Folder of the run; named after the network if not given."""
-    preset: Annotated[Network, tyro.conf.arg(name="config")] = "deltas-small"
+    preset: Annotated[Preset, tyro.conf.arg(name="config")] = "deltas-small"
     """Network and training to start from; the other flags change it. deltas-resnet50 and
-    deltas-vgg9 are the paper's, with its losses and schedule."""
+    deltas-vgg9 are the paper's, with its losses and schedule; cost-volume has no points, and is
+    there to be measured beside the others."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     teacher_weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Published weights of --teacher, or a network of ours; a resumed run wants them again."""
@@ -115,11 +119,11 @@ class Train(Command):
                 raise UserError("too few steps", option, f"give {least} or more")
 
 
-def preset_of(arguments: Sequence[str]) -> Network:
+def preset_of(arguments: Sequence[str]) -> Preset:
     """What --config names: the defaults of the other flags depend on it."""
     for word, following in pairwise([*arguments, ""]):
         name = word.partition("=")[2] if word.startswith("--config=") else following
-        for network in NETWORKS:
+        for network in PRESETS:
             if word.partition("=")[0] == "--config" and name == network:
                 return network
     return "deltas-small"

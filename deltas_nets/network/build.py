@@ -73,11 +73,17 @@ def _paper_stages(
 
 
 def build_matcher(config: MatcherConfig, descriptor_dim: int) -> Matcher:
-    """The matcher a config names."""
+    """The matcher a config names.
+
+    Raises:
+        ValueError: the config is of a network without points.
+    """
     kinds: dict[str, type[JointMatcher] | type[PerViewMatcher]] = {
         "joint": JointMatcher,
         "per_view": PerViewMatcher,
     }
+    if config.kind not in kinds:
+        raise ValueError(f"a network of points has no {config.kind} matcher; see build_network")
     return kinds[config.kind](config, descriptor_dim)
 
 

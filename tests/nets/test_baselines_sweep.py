@@ -209,10 +209,13 @@ def test_frames_without_texture_get_a_depth_in_range(level: float, room: PosedIm
 
 def test_a_source_that_looks_away_changes_nothing(room: PosedImages) -> None:
     images = room.images[:2].float() / 255
-    behind = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ room.views.cam_from_world[:1]
+    # Turned by 80 degrees: what the anchor sees is beside the image, or behind it.
+    cosine, sine = 0.1736, 0.9848
+    turn = torch.tensor([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+    turned = turn @ room.views.cam_from_world[:1]
     views = PosedViews(
         torch.cat([room.views.K[:2], room.views.K[:1]]),
-        torch.cat([room.views.cam_from_world[:2], behind]),
+        torch.cat([room.views.cam_from_world[:2], turned]),
     )
     config = SweepConfig(planes=24)
     alone = plane_sweep(images, room.views.select([0, 1]), (0.5, 10.0), config)

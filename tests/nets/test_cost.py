@@ -25,6 +25,7 @@ from deltas_nets.cost.report import PARTS, comparison_table, cost_table, costs_a
 from deltas_nets.cost.stages import GEOMETRY, followed_stages, parameters_by_stage
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.networks import Network, build_network
 from deltas_nets.reference import ReferenceNetwork
 
 SIZE = (96, 128)
@@ -42,9 +43,9 @@ PER_VIEW = NetworkConfig(name="per view", matcher=MatcherConfig(kind="per_view")
 
 
 @pytest.fixture(scope="module", params=[*CONFIGS.values(), PER_VIEW], ids=lambda it: it.name)
-def model(request: pytest.FixtureRequest) -> Deltas:
+def model(request: pytest.FixtureRequest) -> Network:
     """Every network there is; what it costs does not depend on its weights."""
-    return Deltas(request.param).eval()
+    return build_network(request.param).eval()
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +267,7 @@ def test_measuring_leaves_the_network_as_it_was() -> None:
 # The network.
 
 
-def test_torch_counts_the_same_products(model: Deltas) -> None:
+def test_torch_counts_the_same_products(model: Network) -> None:
     images, views = posed_noise(3, image_size=SIZE)
     counter = OperationCounter()
     with torch.no_grad(), FlopCounterMode(display=False) as reference:
@@ -276,7 +277,7 @@ def test_torch_counts_the_same_products(model: Deltas) -> None:
     assert counter.total().products == reference.get_total_flops() > 0
     by_module = reference.get_flop_counts()
     for name, _ in model.named_children():
-        expected = sum(by_module[f"Deltas.{name}"].values())
+        expected = sum(by_module[f"{type(model).__name__}.{name}"].values())
         assert counter.flops[name].products == expected
     assert not counter.unknown  # every operator has a formula
 

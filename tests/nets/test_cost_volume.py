@@ -13,7 +13,14 @@ from torch.testing import assert_close
 
 from deltas_geom import PosedViews, project, unproject
 from deltas_nets.captures.posed_images import PosedImages
-from deltas_nets.config import CONFIGS, TRAIN_CONFIGS, MatcherConfig, NetworkConfig, TrainConfig
+from deltas_nets.config import (
+    CONFIGS,
+    LOSS_FUNCTIONS,
+    TRAIN_CONFIGS,
+    MatcherConfig,
+    NetworkConfig,
+    TrainConfig,
+)
 from deltas_nets.errors import UserError
 from deltas_nets.losses.losses import training_losses
 from deltas_nets.network.cost_volume.network import CostVolume
@@ -100,6 +107,11 @@ def test_a_map_without_points_is_a_prediction_like_others(
         (6, 8),
         (3, 4),
     ]
+    # Untrained, the coarse scales are in the middle of the inverse depths, 0.1 to 2 1/m.
+    for scale in prediction.evidence.dense.log_depth[2:]:
+        assert_close(scale.exp(), torch.full_like(scale, 1 / 1.05))
+    spread = prediction.evidence.dense.log_spread.exp() * 2**0.5  # of a Laplace distribution
+    assert_close(prediction.std, prediction.depth * spread)  # not calibrated yet
 
 
 def test_sources_in_another_order_and_another_world_give_the_same_depth(
@@ -135,6 +147,7 @@ def test_only_the_dense_losses_teach_it_and_they_reach_all_of_it(
     )
     taught = {name for name, term in losses.terms.items() if term.requires_grad}
     assert taught == {"smoothness", "depth", "gradient", "spread"}
+    assert taught == {name for name in LOSS_FUNCTIONS if getattr(config.loss, name) > 0}
     silent = losses.terms.keys() - taught - {"detector"}
     assert all(losses.terms[name] == 0 for name in silent)
     assert unreached(model, config) == []

@@ -54,7 +54,7 @@ class CountingModel(Deltas):
         return super().encode(images)
 
 
-@pytest.mark.parametrize("name", list(CONFIGS))
+@pytest.mark.parametrize("name", ["deltas-small", "deltas-resnet50", "deltas-vgg9"])
 def test_views_taken_apart_and_joined_are_the_views(name: str) -> None:
     model = Deltas(CONFIGS[name]).eval()
     with torch.no_grad():
