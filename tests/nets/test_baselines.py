@@ -2,11 +2,13 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from room_capture import write_scene
 from run_command import Run, assert_one_line
 
@@ -177,3 +179,17 @@ def test_few_points_on_a_line_still_make_a_map(count: int) -> None:
     pixels = np.array([[1.0, 1], [3, 3], [5, 5]])[:count]
     depth = interpolated(pixels, np.array([1.0, 2.0, 4.0])[:count], (6, 8))
     assert np.isin(depth, [1.0, 2.0, 4.0] if count else [0.0]).all()
+
+
+def test_colmap_finds_nothing_in_images_without_texture(
+    make_capture: Callable[..., Path],
+) -> None:
+    pytest.importorskip("pycolmap")
+    folder = make_capture(num_frames=3)
+    for file in (folder / "color").iterdir():
+        Image.new("RGB", (64, 48), "grey").save(file)
+    capture, config = open_capture(folder), PredictConfig()
+    for name, least in (("colmap-sparse", 0.0), ("colmap-densified", 0.1)):
+        found = look(load_predictor(name), frames_of(capture, SETS), config, Reach(0.5, 10.0))
+        assert len(found.keypoints.depth) == 0
+        assert np.isfinite(found.depth).all() and (found.depth >= least).all()
