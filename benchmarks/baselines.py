@@ -74,7 +74,7 @@ def method(name: str, capture: Any, view_sets: Any, peers: Path | None) -> Metho
             fresh = DeltasPredictor(predictor.encode.model, without_points=predictor.without_points)
             return look(fresh, frames, config, Reach(*ROOM)).depth
         if hasattr(predictor, "encode"):
-            predictor.encode._known.clear()
+            predictor.encode = type(predictor.encode)(predictor.encode.model)
         return look(predictor, frames, config, Reach(*ROOM)).depth
 
     encode = getattr(predictor, "encode", None)
