@@ -1,10 +1,16 @@
 """A depth map after it has heard the maps around it."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from deltas_geom import PosedViews
 from deltas_nets.agree.consensus import consensus
+from deltas_nets.agree.heard import Heard
+from deltas_nets.agree.hidden import hidden
+from deltas_nets.agree.seen_from import seen_from
 from deltas_nets.network.correction import Correction, Places, correction
 from deltas_nets.network.known_depth import KnownDepth, as_points
 
@@ -15,16 +21,26 @@ MOST = 200
 """Places that tell how far the rest of the map is off."""
 
 
-def agreed(own: KnownDepth, others: KnownDepth) -> KnownDepth:
+def agreed(own: KnownDepth, anchor: PosedViews, others: Sequence[Heard]) -> KnownDepth:
     """What several maps say where they do, and elsewhere the own map, moved as they would move it.
 
     Args:
         own: ``(1, H, W)``.
-        others: ``(V, 1, H, W)`` as the anchor sees them, see
-            :func:`deltas_nets.agree.seen_from.seen_from`.
+        anchor: its camera, ``(1)``.
+        others: the maps that it hears.
     """
-    everyone = zip(own, others, strict=True)
-    told = consensus(KnownDepth(*(torch.cat([mine[None], theirs]) for mine, theirs in everyone)))
+    if not others:
+        return own
+    size = (own.depth.shape[-2], own.depth.shape[-1])
+    seen = [seen_from(*heard, anchor, image_size=size) for heard in others]
+    told = consensus(
+        KnownDepth(
+            *(torch.cat([mine[None], *said]) for mine, *said in zip(own, *seen, strict=True))
+        )
+    )
+    told = told._replace(
+        depth=told.depth.masked_fill(hidden(own.depth, told.depth, anchor, others), 0.0)
+    )
     there = own.depth > 0
     log_depth = torch.where(there, own.depth, 1.0).log()
     known = (told.depth > 0) & ~(there & _edges(log_depth))

@@ -12,6 +12,15 @@ TOLERANCE = 0.08
 PIXELS = 1 << 13
 NOWHERE = 1e6
 """Log depth of what is unknown."""
+ASKED = 13
+"""Maps that others agree with or not: the anchor's own and those that share most with it."""
+SUREST = 0.01
+"""Deviation below which no map is believed."""
+
+
+def precision(deviation: Tensor) -> Tensor:
+    """What a map's word is worth."""
+    return deviation.clamp_min(SUREST) ** -2
 
 
 def consensus(maps: KnownDepth) -> KnownDepth:
@@ -37,16 +46,16 @@ def _of_pixels(depth: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
     known = depth > 0
     # What is unknown agrees with nothing that is known.
     log_depth = torch.where(known, depth.log(), NOWHERE)
-    precision = torch.where(known, deviation.clamp_min(0.01) ** -2, 0.0)
-    summed = torch.stack([precision, precision * log_depth, torch.ones_like(precision)])
+    say = torch.where(known, precision(deviation), 0.0)
+    summed = torch.stack([say, say * log_depth, torch.ones_like(say)])
     best, mean = torch.zeros_like(depth[0]), torch.zeros_like(depth[0])
-    for said in log_depth:
+    for said in log_depth[:ASKED]:
         agree = ((log_depth - said).abs_() < TOLERANCE).to(depth)
         total, weighted, count = (summed * agree).sum(dim=1)
         better = (count >= LEAST) & (total > best)
         best = torch.where(better, total, best)
         mean = torch.where(better, weighted / total.clamp_min(1e-9), mean)
-    near = precision * ((log_depth - mean).abs() < TOLERANCE)
+    near = say * ((log_depth - mean).abs() < TOLERANCE)
     total = near.sum(dim=0).clamp_min(1e-9)
     spread = (near * (log_depth - mean).square()).sum(dim=0) / total
     usual = (near > 0).sum(dim=0) / total

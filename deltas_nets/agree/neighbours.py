@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_geom import PosedViews, project, unproject
 
-MOST = 12
+MOST = 24
 """Neighbours that a map hears."""
 LEAST = 0.3
 """Share of each map that the other must see."""

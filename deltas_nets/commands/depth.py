@@ -66,9 +66,9 @@ class Depth(Captured, Measuring, Prediction):
     """Size of the maps; the colour image's if not given."""
     min_confidence: float = 0.0
     """Leave out pixels of less confidence, 0 to 1."""
-    passes: int = 2
-    """2 lets each map hear those of the frames around it, where three or more agree on a place; 1
-    is the network alone."""
+    passes: int = 3
+    """From the second on each map hears those of the frames around it, where three or more agree on
+    a place, and those of sources that get no map themselves; 1 is the network alone."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Maps computed at once, each by one thread; as many as there are cores if not given."""
     mesh: Flag = False
@@ -88,6 +88,7 @@ class Depth(Captured, Measuring, Prediction):
 
     def run(self) -> None:
         """Run the command."""
+        from deltas_nets.captures.companions import companions
         from deltas_nets.captures.keyframes import keyframes
         from deltas_nets.captures.usable import check_all, lone_frames, usable_view_sets, warn_of
         from deltas_nets.captures.working_depth import knows_its_scale
@@ -122,6 +123,8 @@ class Depth(Captured, Measuring, Prediction):
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)
         mine = found.view_sets[shard[0] - 1 :: shard[1]]
+        twice = self.passes > 1 and self.views != 1
+        heard = companions(capture, mine, working_depth=depth) if twice else ()
         search = self._search(capture, [views.anchor for views in mine])
         folder = self._folder(capture, found, shard, options, predictor, config)
         outcome = predict_capture(
@@ -130,6 +133,7 @@ class Depth(Captured, Measuring, Prediction):
             mine,
             folder,
             config,
+            heard=heard,
             search=search,
             short=found.short,
             passes=self.passes,

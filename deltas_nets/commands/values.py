@@ -15,6 +15,9 @@ __all__ = ["at_least_one", "check_values", "not_negative", "positive", "read_sha
 LEAST_SIDE = 32  # px
 
 
+MOST_PASSES = 9
+
+
 def check_values(command: Command) -> None:
     """Refuse what no command can mean by a flag of that name.
 
@@ -91,8 +94,9 @@ def positive(value: float, flag: str) -> None:
 
 
 def _passes(value: int, flag: str) -> None:
-    if value not in (1, 2):
-        raise UserError("there is no such pass", f"{flag} {value}", "use 1 or 2")
+    if not 1 <= value <= MOST_PASSES:
+        what = "no such number of passes"
+        raise UserError(what, f"{flag} {value}", f"use 1 to {MOST_PASSES}, 3 is usual")
 
 
 def _positive(value: float, flag: str) -> None:

@@ -1,8 +1,9 @@
-"""Maps of the first pass, kept until all are there: a folder of safetensors beside the outputs."""
+"""Maps of the passes before the last, kept until all are there: safetensors beside the outputs."""
 
 import json
 import re
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,12 @@ class FirstMaps:
     def __init__(self, out: Path, shard: tuple[int, int] = (1, 1)) -> None:
         part = "" if shard[1] == 1 else ".{}-of-{}".format(*shard)
         self.folder = out / f"{FIRST}{part}"
+
+    def of_pass(self, number: int) -> "FirstMaps":
+        """Those of a later pass, 2 or more; they go when the first ones go."""
+        later = copy(self)
+        later.folder = self.folder / f"pass-{number}"
+        return later
 
     def file(self, id: str) -> Path:
         """Where the map of a frame lies."""

@@ -13,14 +13,15 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.check.workers import side_by_side
+from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.folder import OutputFolder
 from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.outputs.verdict import Verdict, verdict
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig
+from deltas_nets.predict.later_passes import LaterPasses
 from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Asked, Found, Search
-from deltas_nets.predict.second_pass import SecondPass
 
 SECONDS_BETWEEN_SUMMARIES = 5.0
 FEWEST = 3
@@ -71,6 +72,7 @@ def predict_capture(
     folder: OutputFolder,
     config: PredictConfig,
     *,
+    heard: Sequence[ViewSet] = (),
     search: Search | None = None,
     short: int = 0,
     passes: int = 1,
@@ -85,10 +87,11 @@ def predict_capture(
         view_sets: anchors and sources.
         folder: from :func:`deltas_nets.outputs.folder.prepare_output`.
         config: sizes, range, confidence.
+        heard: view sets whose maps the others hear in later passes, and nobody sees.
         search: how depth is searched; in the config's range if not given.
         short: view sets with fewer views than asked, for the verdict.
-        passes: 2 lets each map hear those of the frames around it; networks that state no
-            deviation have no second.
+        passes: with 2 or more each map hears those of the frames around it, in every pass as
+            they were after the one before; networks that state no deviation have one.
         threads: maps computed at once, each by one thread; with 1 torch's threads share a map.
         progress: gets the name and the number of each pass's maps.
 
@@ -101,7 +104,8 @@ def predict_capture(
     """
     search = search or Asked(capture, config.depth_range)
     first = folder.first
-    twice = passes > 1 and predictor.states_confidence and len(view_sets) >= FEWEST
+    seen = (*view_sets, *heard)
+    twice = passes > 1 and predictor.states_confidence and len(seen) >= FEWEST
     kept = [views.anchor for views in view_sets if folder.is_finished(views.anchor)]
     for id in kept:
         folder.keep_frame(id)
@@ -112,7 +116,7 @@ def predict_capture(
     try:
         if twice and missing:
             # Of the finished ones too: what the others hear must not depend on when a run ended.
-            unseen = [views for views in view_sets if first.read(views.anchor) is None]
+            unseen = [views for views in seen if first.read(views.anchor) is None]
             with progress("depth", len(unseen)) as report:
 
                 def see(views: ViewSet) -> str:
@@ -126,10 +130,13 @@ def predict_capture(
                 for id in side_by_side(see, unseen, threads):
                     report(id)
                     summaries.now_and_then()
-            second = SecondPass(capture, first, [views.anchor for views in view_sets])
+            later = LaterPasses(capture, first, [views.anchor for views in seen])
+            told = first
+            for number in range(2, passes):
+                told = _passed_on(later, told, number, seen, threads, progress, summaries)
 
             def make(views: ViewSet) -> tuple[str, dict[str, Any]]:
-                found, record = second(views.anchor, config)
+                found, record = later.finished(views.anchor, later.hear(views.anchor, told), config)
                 record["network_confidence"] = record["confidence"]
                 record |= _confidence(found.confidence)
                 _write(capture, views, folder, found, record)
@@ -153,6 +160,30 @@ def predict_capture(
         seconds = round(time.perf_counter() - began, 3)
         folder.write_summary(status, seconds=seconds, verdict=said.line)
     return outcome._replace(verdict=said) if outcome.written else outcome
+
+
+def _passed_on(
+    later: LaterPasses,
+    told: FirstMaps,
+    number: int,
+    seen: Sequence[ViewSet],
+    threads: int,
+    progress: Progress,
+    summaries: "_Summaries",
+) -> FirstMaps:
+    """The maps of a pass between the first and the last, which heard those of the one before."""
+    maps = later.first.of_pass(number)
+
+    def pass_on(views: ViewSet) -> str:
+        maps.write(views.anchor, later.hear(views.anchor, told), {})
+        return views.anchor
+
+    unheard = [views for views in seen if maps.read(views.anchor) is None]
+    with progress("agreement", len(unheard)) as report:
+        for id in side_by_side(pass_on, unheard, threads):
+            report(id)
+            summaries.now_and_then()
+    return maps
 
 
 class _Summaries:

@@ -13,6 +13,8 @@ from torch.testing import assert_close
 from deltas_geom import PosedViews
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.consensus import LEAST, TOLERANCE, consensus
+from deltas_nets.agree.heard import Heard
+from deltas_nets.agree.hidden import SAME, hidden, votes
 from deltas_nets.agree.neighbours import neighbours, sample
 from deltas_nets.agree.seen_from import seen_from
 from deltas_nets.network.known_depth import KnownDepth
@@ -86,16 +88,30 @@ def test_three_that_agree_outvote_one_and_two_do_not(seed: int, scale: float) ->
     assert not consensus(sure(three[1:])).depth.any()
 
 
+def same_place(depth: Tensor, deviation: float = 0.02) -> list[Heard]:
+    """Maps ``(V, 1, H, W)`` whose cameras stand where the anchor's does."""
+    views = PosedViews(*(part.expand(len(depth), *part.shape[1:]) for part in camera(0)))
+    return [Heard(sure(depth, deviation), views)]
+
+
 def test_a_map_takes_what_three_others_say_and_moves_the_rest_as_they_would() -> None:
     truth = wall(camera(0))
     own = sure(truth[0] * 1.2, 0.1)
     others = truth.repeat(3, 1, 1, 1)
     others[..., 20:] = 0  # nobody sees the right side
-    found = agreed(own, sure(others))
+    found = agreed(own, camera(0), same_place(others))
     assert_close(found.depth[..., :20], truth[0, ..., :20])
     left = (found.depth[0, :, 20:] / truth[0, 0, :, 20:] - 1).mean(dim=0)
     assert (left.diff() > 0).all() and 0 < left[0] < 0.06 and left[-1] < 0.15
     assert_close(found.deviation[..., 20:], own.deviation[..., 20:])
+
+
+def test_maps_of_two_sizes_are_heard_together() -> None:
+    truth = wall(camera(0))
+    own = sure(truth[0] * 1.2, 0.1)
+    together = agreed(own, camera(0), same_place(truth.repeat(3, 1, 1, 1)))
+    apart = agreed(own, camera(0), same_place(truth) + same_place(truth.repeat(2, 1, 1, 1)))
+    assert_close(apart.depth, together.depth)
 
 
 def test_holes_of_a_map_are_filled_or_stay_holes() -> None:
@@ -104,7 +120,8 @@ def test_holes_of_a_map_are_filled_or_stay_holes() -> None:
     depth[..., 5:15, 5:15], depth[..., 5:15, 22:32] = 0, 0
     others = truth.repeat(3, 1, 1, 1)
     others[..., 20:] = 0
-    found = agreed(KnownDepth(depth, torch.full_like(depth, 0.1)), sure(others))
+    own = KnownDepth(depth, torch.full_like(depth, 0.1))
+    found = agreed(own, camera(0), same_place(others))
     assert found.depth.isfinite().all() and found.deviation.isfinite().all()
     assert_close(found.depth[..., 5:15, 5:15], truth[0, ..., 5:15, 5:15])
     assert not found.depth[..., 5:15, 22:32].any()
@@ -112,8 +129,63 @@ def test_holes_of_a_map_are_filled_or_stay_holes() -> None:
 
 def test_a_map_that_nobody_sees_stays() -> None:
     own = sure(wall(camera(0))[0])
-    nothing = KnownDepth(torch.zeros(2, 1, *SIZE).double(), torch.zeros(2, 1, *SIZE).double())
-    assert agreed(own, nothing) is own
+    assert agreed(own, camera(0), same_place(torch.zeros(2, 1, *SIZE).double())) is own
+    assert agreed(own, camera(0), []) is own
+
+
+def box_before_a_wall(view: PosedViews, *, box: bool) -> Tensor:
+    """A wall at 3 m and, if a box is there, 1 m before the camera what is nearer than x = 0.1."""
+    depth = wall(view)
+    if box:
+        near = wall(view, 1.0)
+        columns = torch.arange(SIZE[1], dtype=torch.float64)
+        x = (columns - K[0, 2]) / K[0, 0] - view.cam_from_world[0, 0, 3]
+        depth = torch.where(x < 0.1, near, depth)
+    return depth
+
+
+@given(st.integers(3, 6), st.floats(0.1, 0.3))
+def test_a_wall_behind_a_box_is_not_seen_however_many_agree(count: int, step: float) -> None:
+    anchor = camera(0)
+    # From the right all look past the box to the wall that it hides from the anchor.
+    right = [camera(0.7 + step * number / count) for number in range(count)]
+    walls = torch.cat([wall(view) for view in right])
+    beside = camera(0.02)
+    others = [
+        Heard(sure(walls), PosedViews(*(torch.cat(part) for part in zip(*right, strict=True)))),
+        Heard(sure(box_before_a_wall(beside, box=True)), beside),
+    ]
+    own = sure(box_before_a_wall(anchor, box=True)[0])
+    found = agreed(own, anchor, others)
+    assert_close(found.depth, own.depth, rtol=0.03, atol=0)
+
+
+def test_a_box_that_the_others_look_through_is_not_there() -> None:
+    anchor = camera(0)
+    others = same_place(wall(anchor).repeat(3, 1, 1, 1))
+    own = sure(box_before_a_wall(anchor, box=True)[0])
+    found = agreed(own, anchor, others)
+    inner = found.depth[..., :14]  # beside the edge the own map knows best
+    assert_close(inner, wall(anchor)[0][..., :14], rtol=0.03, atol=0)
+
+
+@pytest.mark.parametrize("through", [1, 2])
+def test_a_nearer_thing_needs_no_fewer_who_see_it_than_look_through(through: int) -> None:
+    far, near = torch.full((1, *SIZE), 3.0).double(), torch.full((1, *SIZE), 1.0).double()
+    others = same_place(torch.cat([near[None]] + [far[None]] * through))
+    gone = hidden(far, near, camera(0), others)
+    assert gone.all() if through == 2 else not gone.any()
+
+
+@given(st.floats(0.3, 3))
+def test_votes_are_for_against_or_none(scale: float) -> None:
+    depth = torch.full((1, *SIZE), 2.0).double()
+    others = same_place(depth[None] * scale)
+    said = votes(depth, torch.arange(depth.numel()), camera(0), others)
+    off = math.log(scale)
+    expected = (0.02**-2 * (abs(off) < SAME), 0.02**-2 * (off >= SAME))
+    assert_close(said.support, torch.full_like(said.support, expected[0]))
+    assert_close(said.against, torch.full_like(said.against, expected[1]))
 
 
 def test_neighbours_are_those_that_share_most() -> None:

@@ -65,7 +65,7 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
     assert depth("threads", "--workers", 3).code == 0
     assert np.allclose(maps(tmp_path / "threads"), maps(tmp_path / "whole"), rtol=1e-5)
 
-    # Stopped in the first pass, stopped in the second, and finished.
+    # Stopped in the first pass, in the second and in the third, and finished.
     keep, write, calls = FirstMaps.write, OutputFolder.write_frame, []
 
     def stopped(function: Any, at: int) -> Any:
@@ -79,16 +79,23 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
 
     monkeypatch.setattr(FirstMaps, "write", stopped(keep, 4))
     assert depth("broken", "--workers", 1).code == 130
-    monkeypatch.setattr(FirstMaps, "write", keep)
-    monkeypatch.setattr(OutputFolder, "write_frame", stopped(write, 7))
+    monkeypatch.setattr(FirstMaps, "write", stopped(keep, 8))
     assert depth("broken", "--workers", 1).code == 130
-    assert len(list((tmp_path / "broken" / FIRST).iterdir())) == 5
-    (tmp_path / "broken" / FIRST / "4.safetensors").write_bytes(b"cut")
+    first = tmp_path / "broken" / FIRST
+    assert (len(list(first.glob("*.*"))), len(list(first.glob("*/*.*")))) == (5, 1)
+    monkeypatch.setattr(FirstMaps, "write", keep)
+    monkeypatch.setattr(OutputFolder, "write_frame", stopped(write, 11))
+    assert depth("broken", "--workers", 1).code == 130
+    assert (len(list(first.glob("*.*"))), len(list(first.glob("*/*.*")))) == (5, 5)
+    (first / "4.safetensors").write_bytes(b"cut")
+    (first / "pass-2" / "3.safetensors").write_bytes(b"cut")
     monkeypatch.setattr(OutputFolder, "write_frame", write)
     assert depth("broken", "--workers", 1).code == 0
     assert np.allclose(maps(tmp_path / "broken"), maps(tmp_path / "whole"), rtol=1e-5)
 
     assert not np.allclose(maps(tmp_path / "whole"), maps(tmp_path / "once"), rtol=1e-2)
+    assert depth("twice", "--passes", 2).code == 0
+    assert not np.allclose(maps(tmp_path / "whole"), maps(tmp_path / "twice"), rtol=1e-4)
     # Another network's first maps are not taken for ours, and shards leave each other's alone.
     left = FirstMaps(tmp_path / "broken", (2, 2))
     left.write("0", KnownDepth(torch.ones(1, 4, 4), torch.ones(1, 4, 4)), {})
@@ -96,6 +103,21 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
     assert depth("broken", "--overwrite", "--passes", 1).code == 0 and not left.has("0")
     summary = json.loads((tmp_path / "whole" / "summary.json").read_text())
     assert all("valid_points" in frame for frame in summary["frames"].values())
+
+
+def test_sources_that_get_no_map_are_heard_all_the_same(
+    run: Run, scene: Path, tmp_path: Path
+) -> None:
+    sets = tmp_path / "sets.json"
+    sets.write_text('[{"anchor": 2, "sources": [1, 3]}]')
+    fixed = ("--format", "npz", "--no-page", "--view-sets", sets, "--work-size", 64, 96)
+    found = {}
+    for name, passes in (("alone", 1), ("heard", 2)):
+        out = tmp_path / name
+        assert run("depth", scene, "--out", out, *fixed, "--passes", passes).code == 0
+        assert [file.stem for file in (out / "depth").iterdir()] == ["2"]
+        found[name] = read_depth_map(out, "2", 1000)
+    assert not np.allclose(found["alone"], found["heard"], rtol=1e-3)
 
 
 def test_measured_depth_makes_maps_better_and_alone_completes_them(
@@ -127,7 +149,7 @@ def test_measured_depth_makes_maps_better_and_alone_completes_them(
     ("flags", "parts"),
     [
         (("--views", 1), ("--views 1", "--sensor-depth")),
-        (("--passes", 3), ("--passes 3",)),
+        (("--passes", 10), ("--passes 10",)),
         (("--workers", 0), ("--workers 0",)),
         (("--sensor-depth", "points"), ("no sparse points",)),
         (("--sensor-depth", "nowhere.txt"), ("nowhere.txt",)),

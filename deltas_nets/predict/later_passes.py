@@ -1,4 +1,4 @@
-"""The second pass over a capture: each map hears those of the frames around it."""
+"""The later passes over a capture: each map hears those of the frames around it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,8 +10,8 @@ import torch
 from deltas_geom import PosedViews
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.agreed import agreed
+from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.neighbours import neighbours, sample
-from deltas_nets.agree.seen_from import seen_from
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.straight import straight
 from deltas_nets.errors import UserError
@@ -20,10 +20,10 @@ from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
 from deltas_nets.predict.look import as_photographed
 
-__all__ = ["SecondPass"]
+__all__ = ["LaterPasses"]
 
-REMEMBERED = 32
-"""Maps that are kept in memory: 0.7 MB each."""
+REMEMBERED = 64
+"""Maps of a pass that are kept in memory: 0.7 MB each."""
 
 
 class _First(NamedTuple):
@@ -34,8 +34,11 @@ class _First(NamedTuple):
     record: dict[str, Any]
 
 
-class SecondPass:
+class LaterPasses:
     """Maps of a capture after they have heard each other.
+
+    A map that has heard others is a better one to hear. What hears is the map of the first pass in
+    every pass: one that hears and hears again forgets what it saw itself.
 
     Args:
         capture: the frames.
@@ -49,10 +52,10 @@ class SecondPass:
     def __init__(self, capture: Capture, first: FirstMaps, ids: Sequence[str]) -> None:
         self.capture = capture
         self.first = first
-        self._read = lru_cache(maxsize=REMEMBERED)(self._from_disk)
+        self._read = lru_cache(maxsize=2 * REMEMBERED)(self._from_disk)
         points, views, sizes = [], [], []
         for id in ids:
-            found = self._read(id)
+            found = self._read(first, id)
             points.append(sample(found.map.depth, found.view))
             views.append(found.view)
             sizes.append((found.map.depth.shape[-2], found.map.depth.shape[-1]))
@@ -61,39 +64,42 @@ class SecondPass:
         self._around = {id: [ids[n] for n in near] for id, near in zip(ids, around, strict=True)}
 
     @torch.inference_mode()
-    def __call__(self, id: str, config: PredictConfig) -> tuple[DepthMap, dict[str, Any]]:
-        """The map of a frame, and what the first pass recorded of it.
+    def hear(self, id: str, told: FirstMaps) -> KnownDepth:
+        """The map ``(1, h, w)`` of a frame that has heard those of the pass before.
+
+        Args:
+            id: the frame.
+            told: the maps of that pass.
 
         Raises:
-            UserError: the image cannot be read, or a map of the first pass is gone.
+            UserError: a map is gone.
         """
-        own = self._read(id)
-        size = (own.map.depth.shape[-2], own.map.depth.shape[-1])
-        heard = [self._read(near) for near in self._around[id]]
-        seen = [
-            seen_from(
-                KnownDepth(*(torch.stack(parts) for parts in zip(*alike[0], strict=True))),
-                PosedViews(*(torch.cat(parts) for parts in zip(*alike[1], strict=True))),
-                own.view,
-                image_size=size,
-            )
-            for alike in _by_size(heard)
-        ]
-        found = own.map
-        if seen:
-            found = agreed(found, KnownDepth(*map(torch.cat, zip(*seen, strict=True))))
+        own = self._read(self.first, id)
+        heard = [self._read(told, near) for near in self._around[id]]
+        return agreed(own.map, own.view, _by_size(heard))
+
+    @torch.inference_mode()
+    def finished(
+        self, id: str, found: KnownDepth, config: PredictConfig
+    ) -> tuple[DepthMap, dict[str, Any]]:
+        """A map as it is written, and what the first pass recorded of it.
+
+        Raises:
+            UserError: the image cannot be read.
+        """
         photo = self.capture.frame(id)
         anchor = straight(photo)
         of_straight = config if anchor is photo else replace(config, size=None)
+        size = (found.depth.shape[-2], found.depth.shape[-1])
         nothing = KeypointDepths(torch.zeros(0, 2), torch.zeros(0), size)
         result = finished_map(anchor, found, nothing, of_straight)
-        return as_photographed(result, anchor, config), own.record
+        return as_photographed(result, anchor, config), self._read(self.first, id).record
 
-    def _from_disk(self, id: str) -> _First:
-        read = self.first.read(id)
+    def _from_disk(self, told: FirstMaps, id: str) -> _First:
+        read = told.read(id)
         if read is None:
-            what = f"the map of the first pass of frame {id} is gone or damaged"
-            raise UserError(what, self.first.file(id), "run the same command again")
+            what = f"a map of frame {id} from an earlier pass is gone or damaged"
+            raise UserError(what, told.file(id), "run the same command again")
         found, record = read
         frame = straight(self.capture.frame(id))
         size = (found.depth.shape[-2], found.depth.shape[-1])
@@ -102,11 +108,15 @@ class SecondPass:
         return _First(found, view, record)
 
 
-def _by_size(heard: Sequence[_First]) -> list[tuple[list[KnownDepth], list[PosedViews]]]:
+def _by_size(heard: Sequence[_First]) -> list[Heard]:
     """Maps and cameras, those of one size together: mostly all of them."""
-    groups: dict[torch.Size, tuple[list[KnownDepth], list[PosedViews]]] = {}
+    groups: dict[torch.Size, list[_First]] = {}
     for other in heard:
-        maps, views = groups.setdefault(other.map.depth.shape, ([], []))
-        maps.append(other.map)
-        views.append(other.view)
-    return list(groups.values())
+        groups.setdefault(other.map.depth.shape, []).append(other)
+    return [
+        Heard(
+            KnownDepth(*map(torch.stack, zip(*(one.map for one in alike), strict=True))),
+            PosedViews(*map(torch.cat, zip(*(one.view for one in alike), strict=True))),
+        )
+        for alike in groups.values()
+    ]
