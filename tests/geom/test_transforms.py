@@ -241,9 +241,12 @@ def compiled_as_eager(
     function, make = FUNCTIONS[name]
     counter = CompileCounterWithBackend(backend)
     compiled = torch.compile(function, fullgraph=True, dynamic=dynamic, backend=counter)
+    compilations = []
     for count in counts:
         inputs = leaves(make(count)) if gradients else make(count)
         found, wanted = compiled(*inputs), function(*inputs)
+        # The first may begin anew: torch takes numbers for inputs until one cannot be.
+        compilations.append(counter.frame_count)
         for ours, theirs in zip(found, wanted, strict=True):
             assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
         if not gradients:
@@ -251,7 +254,7 @@ def compiled_as_eager(
         totals = (sum(value.sum() for value in values) for values in (found, wanted))
         for ours, theirs in zip(*(torch.autograd.grad(t, inputs) for t in totals), strict=True):
             assert_close(ours, theirs, rtol=1e-7, atol=1e-9 * float(theirs.abs().max()))
-    assert counter.frame_count == 1
+    assert len(set(compilations)) == 1
     torch.compiler.reset()
 
 
