@@ -108,7 +108,7 @@ def page() -> Iterator[str]:
     yield "Written by `python benchmarks/results.py` from the records in [results](results), each"
     yield "of which names its command, data, weights, versions and machine. ScanNet and Sun3D could"
     yield "not be had: where the paper's figures are theirs, ours stand on other captures, and the"
-    yield "two are no comparison. How to measure each table on ScanNet: [evaluation](evaluation.md)."
+    yield "two are no comparison. [evaluation](evaluation.md) says how to measure each on ScanNet."
     yield from detectors()
     yield from depth()
     yield from lengths()
@@ -118,7 +118,7 @@ def page() -> Iterator[str]:
     yield ""
     yield "## Other methods"
     yield ""
-    yield "Plane sweep, COLMAP, a cost-volume network, networks of others: [baselines](baselines.md)."
+    yield "Plane sweep, COLMAP, a cost volume, networks of others: [baselines](baselines.md)."
 
 
 def detectors() -> Iterator[str]:

@@ -16,13 +16,13 @@ from deltas_geom.cameras.poses import invert_pose
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.images import header_of_whole_file
-from deltas_nets.captures.scaled import scaled
 from deltas_nets.captures.straight import StraightFrame, photo_pixels, straight
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.depth_view import DepthView
 from deltas_nets.fuse.deviation import std_of_confidence, std_of_sensor
-from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, MAKE_ANEW, read_depth_map
+from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale
+from deltas_nets.outputs.their_capture import made_of
 
 __all__ = ["DepthSource", "Predicted", "Sensed", "depth_source"]
 
@@ -95,21 +95,12 @@ class Predicted:
     def __init__(
         self, capture: Capture, folder: Path, *, min_confidence: float | None = None
     ) -> None:
-        summary = read_summary(folder / SUMMARY)
-        if summary is None or "view_sets" not in summary["settings"]:
+        if read_summary(folder / SUMMARY) is None:
             what = "the folder holds no depth maps of deltas depth"
             raise UserError(what, folder, "run deltas depth first, or write sensor instead")
-        made_of = summary["settings"].get("capture", {}).get("cameras")
-        factor = summary.get("scaled_by", 1.0) / capture.scaled_by
-        if factor != 1:
-            capture = scaled(capture, factor, metric=summary.get("unit") == "metre")
-        if made_of != capture.fingerprint():
-            raise UserError(
-                f"the maps were made of other cameras than those of {capture.path}",
-                folder / SUMMARY,
-                "name their capture, with the same --intrinsics, or run deltas depth again",
-            )
-        self.capture = capture
+        found = made_of(capture, folder)
+        summary = found.summary
+        self.capture = found.capture
         self._folder = folder
         self._scale = recorded_depth_scale(folder)
         self._has_confidence = "confidence" in summary.get("files", ())
@@ -117,11 +108,7 @@ class Predicted:
             what = "the maps state no confidence"
             raise UserError(what, "--min-confidence", "leave it out")
         self._least = round(255 * (LEAST_CONFIDENCE if min_confidence is None else min_confidence))
-        wanted = [str(anchor) for anchor, _ in summary["settings"]["view_sets"]]
-        self.ids = [id for id in wanted if _has_map(folder, id)]
-        self.missing = len(wanted) - len(self.ids)
-        if not self.ids:
-            raise UserError("the folder has no finished map", folder, "run deltas depth again")
+        self.ids, self.missing = found.ids, len(found.missing)
         self.least_confidence = self._least / 255 if self._has_confidence else 0.0
         self.doubtful: dict[str, float] = {}
         self.settings = {"depth": summary["settings"], "min_confidence": self._least / 255}
@@ -185,10 +172,6 @@ class Sensed:
         if frame.depth_K is None and frame.cam_from_depth is None:
             return _of_photo(frame, depth, std, most=MOST_SENSED)
         return _of_own_camera(frame, depth, std)
-
-
-def _has_map(folder: Path, id: str) -> bool:
-    return any((folder / "depth" / f"{id}.{name}").exists() for name in DEPTH_FORMATS)
 
 
 def _read_confidence(path: Path) -> NDArray[np.uint8]:

@@ -129,7 +129,7 @@ def _verdict(maps: Maps) -> dict[str, Any]:
 
 def _numbers(record: Mapping[str, Any]) -> dict[str, float]:
     """What a verdict reads, of a summary that may be of another version."""
-    names = ("confidence", "valid_points", "keypoints", "seconds")
+    names = ("confidence", "network_confidence", "valid_points", "keypoints", "seconds")
     found = {name: record[name] for name in names if isinstance(record.get(name), int | float)}
     if "valid_points" not in found:
         found.pop("keypoints", None)
@@ -175,6 +175,10 @@ def _notes(maps: Maps, frames: Sequence[ShownFrame]) -> list[str]:
         )
     if maps.missing:
         notes.append(f"{counted(len(maps.missing), 'map')} missing; the same deltas depth goes on.")
+    measured = maps.summary["settings"].get("sensor_depth")
+    scored = any(frame.score is not None for frame in frames)
+    if scored and isinstance(measured, dict) and measured.get("from") == "sensor":
+        notes.append("The maps were made with the sensor depth that they are scored against.")
     if maps.unit != "m":
         notes.append("The capture has no metres: depth is in its own unit.")
     return notes

@@ -10,21 +10,15 @@ from PIL import Image
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.scaled import scaled
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, MAKE_ANEW, read_depth_map
+from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.products import read_points_ply
-from deltas_nets.outputs.summary import (
-    SUMMARY,
-    read_summary,
-    recorded_depth_scale,
-    recorded_view_sets,
-)
+from deltas_nets.outputs.summary import recorded_depth_scale
+from deltas_nets.outputs.their_capture import METRE, made_of, map_file
 from deltas_nets.terminal import warn
 
 __all__ = ["Maps", "open_maps"]
 
-METRE = "metre"
 FUSED = ("mesh.ply", "cloud.ply")
 """What `deltas fuse` writes."""
 
@@ -68,7 +62,7 @@ class Maps(NamedTuple):
         """
         depth = read_depth_map(self.folder, id, self.steps)
         if depth.ndim != 2 or depth.size == 0:
-            file = _map_file(self.folder, id) or self.folder / "depth" / id
+            file = map_file(self.folder, id) or self.folder / "depth" / id
             raise UserError("this is no depth map", file, MAKE_ANEW)
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
@@ -121,40 +115,10 @@ def open_maps(capture: Capture, folder: Path, fused: Path | None = None) -> Maps
     """
     if fused is not None and not any((fused / name).exists() for name in FUSED):
         raise UserError(f"there is no {' or '.join(FUSED)}", fused, "run deltas fuse first")
-    anchors = [views.anchor for views in recorded_view_sets(folder)]
-    summary = read_summary(folder / SUMMARY) or {}
-    capture = _as_recorded(capture, folder, summary)
-    wanted = set(anchors)
-    known = [id for id in capture.frames if id in wanted]
-    if not known:
-        what = f"the capture has none of the frames of the maps ({ids_in_words(anchors)})"
-        raise UserError(what, folder, "name the capture that the maps were made of")
-    ids = tuple(id for id in known if _map_file(folder, id))
-    missing = tuple(id for id in known if not _map_file(folder, id))
-    if not ids:
-        raise UserError("there is no depth map", folder / "depth", "run deltas depth first")
+    capture, ids, missing, summary = made_of(capture, folder)
     if missing:
-        warn(f"{len(missing)} of {len(known)} maps are missing: {ids_in_words(missing)}")
+        warn(
+            f"{len(missing)} of {len(ids) + len(missing)} maps are missing: {ids_in_words(missing)}"
+        )
     steps = recorded_depth_scale(folder)
     return Maps(folder, capture, ids, missing, summary, steps, fused or folder)
-
-
-def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> Capture:
-    factor = summary.get("scaled_by", 1.0)
-    if isinstance(factor, int | float) and factor > 0 and factor != capture.scaled_by:
-        metric = summary.get("unit", METRE) == METRE
-        capture = scaled(capture, factor / capture.scaled_by, metric=metric)
-    recorded = summary["settings"].get("capture")
-    cameras = recorded.get("cameras") if isinstance(recorded, dict) else None
-    if cameras is not None and cameras != capture.fingerprint():
-        raise UserError(
-            "the maps are of other cameras than the capture has",
-            folder,
-            "name the capture that they were made of, with the same --intrinsics",
-        )
-    return capture
-
-
-def _map_file(folder: Path, id: str) -> Path | None:
-    files = (folder / "depth" / f"{id}.{name}" for name in DEPTH_FORMATS)
-    return next(filter(Path.exists, files), None)

@@ -225,6 +225,20 @@ def test_depth_ends_with_a_page_unless_told_otherwise(
     assert hindered.code == 0 and "no space" in hindered.warnings[-1]
 
 
+def test_the_verdict_and_the_scores_say_what_they_rest_on(filled: tuple[Path, Path]) -> None:
+    capture, folder = filled
+    file = folder / "summary.json"
+    summary = json.loads(file.read_text())
+    summary["settings"]["sensor_depth"] = {"from": "sensor"}
+    for record in summary["frames"].values():
+        record["network_confidence"] = 0.2  # before maps heard each other
+    file.write_text(json.dumps(summary))
+    page_of(capture, folder)
+    data = data_of(folder)
+    assert data["verdict"]["line"].startswith("mean confidence 0.20")
+    assert len(data["notes"]) == 1 and "they are scored against" in data["notes"][0]
+
+
 # What is wrong
 
 
