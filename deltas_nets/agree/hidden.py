@@ -47,7 +47,7 @@ def hidden(own: Tensor, told: Tensor, anchor: PosedViews, others: Sequence[Heard
         others: the maps.
 
     Returns:
-        ``(1, H, W)`` bool. Farther than the own depth: hidden if others support the own one.
+        ``(1, H, W)`` bool. Farther than the own depth: hidden unless many look through that.
         Nearer: not there if more look through it than support it.
     """
     both = (own > 0) & (told > 0)
@@ -56,7 +56,7 @@ def hidden(own: Tensor, told: Tensor, anchor: PosedViews, others: Sequence[Heard
     before = (ratio < -TOLERANCE).flatten().nonzero()[:, 0]
     found = torch.zeros(own.numel(), dtype=torch.bool, device=own.device)
     kept = votes(own, behind, anchor, others)
-    found[behind] = LOOKED_THROUGH * kept.support > kept.against
+    found[behind] = LOOKED_THROUGH * kept.support >= kept.against
     nearer = votes(told, before, anchor, others)
     found[before] = nearer.against > nearer.support
     return found.view(own.shape)
