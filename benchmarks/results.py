@@ -62,6 +62,7 @@ def main() -> None:
     if sys.argv[1:2] == ["measure"]:
         for name, capture in zip(CAPTURES, sys.argv[2:4], strict=True):
             measure_depth(name, Path(capture))
+        measure_pairs()
         measure_inference(Path(sys.argv[2]))
     PAGE.write_text("\n".join(page()) + "\n", encoding="utf-8")
 
@@ -69,7 +70,8 @@ def main() -> None:
 def deltas(*words: object) -> None:
     """Run a command of deltas; what it prints is seen."""
     print("deltas", *words, flush=True)
-    subprocess.run([sys.executable, "-m", "deltas_nets.cli", *map(str, words)], check=True)
+    program = Path(sys.executable).with_name("deltas")
+    subprocess.run([program, *map(str, words)], check=True)
 
 
 def measure_depth(name: str, capture: Path) -> None:
@@ -88,6 +90,15 @@ def measure_depth(name: str, capture: Path) -> None:
             deltas("depth", capture, *sets, "--views", views, *out)
             file = RESULTS / "depth" / f"{name}-{views}-heard.json"
             deltas("evaluate", capture, "--predictions", folder, "--json", file)
+
+
+def measure_pairs() -> None:
+    """Table 4, on rooms in its layout."""
+    with tempfile.TemporaryDirectory() as folder:
+        pairs = Path(folder) / "pairs"
+        script = [sys.executable, "benchmarks/room_scenes.py", "demon", str(pairs), "40"]
+        subprocess.run(script, check=True)
+        deltas("evaluate", pairs, "--json", RESULTS / "depth" / "pairs.json")
 
 
 def measure_inference(walk: Path) -> None:
@@ -219,8 +230,9 @@ def head(title: str, file: Path) -> list[str]:
 
 
 def depth_of(name: str, keys: Sequence[str] | dict[str, str]) -> list[str]:
-    """Figures of a record of `deltas evaluate`: means over the maps of its one scene."""
-    row: Row = read_record(RESULTS / "depth" / f"{name}.json").rows[0]
+    """Figures of a record of `deltas evaluate`: means over the dense maps of all its scenes."""
+    rows = read_record(RESULTS / "depth" / f"{name}.json").rows
+    row: Row = [row for row in rows if row["scores"] == "dense"][-1]
     return figures(row.get(key) for key in keys)
 
 
