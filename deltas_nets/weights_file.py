@@ -12,6 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from deltas_nets.config import NetworkConfig, from_dict, to_dict
+from deltas_nets.config.baselines import BASELINES
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.networks import Network, build_network
@@ -70,9 +71,8 @@ def weights_file(name_or_file: str | Path) -> Path:
     if file.suffix != ".safetensors" and shipped.is_file():
         return shipped
     if not file.is_file():
-        raise UserError(
-            "no such weights", file, f"name a .safetensors file or a shipped network ({DEFAULT})"
-        )
+        known = ", ".join((DEFAULT, *BASELINES))
+        raise UserError("no such weights", file, f"name a .safetensors file or one of {known}")
     return file
 
 

@@ -72,6 +72,11 @@ def usable_view_sets(
     return UsableViews(view_sets, sum(len(views.sources) < wanted - 1 for views in view_sets))
 
 
+def sets_file(file: Path | None, capture: Path) -> Path | None:
+    """The file of view sets: as it is named or, if it is not there, of that name in the capture."""
+    return capture / file if file is not None and not file.exists() else file
+
+
 def lone_frames(capture: Capture, file: Path | None, anchors: Sequence[str] | None) -> UsableViews:
     """Anchors without sources, for maps that rest on measured depth alone.
 

@@ -41,7 +41,11 @@ class MeasuredSeries(Command):
     """Show the traceback of an error."""
 
     going_on: ClassVar[str] = "start it again; what is done is kept"
-    checks: ClassVar = {"sets": at_least_one, "seed": not_negative}
+    checks: ClassVar = {
+        "view_sets": lambda value, flag: None,  # it may lie in the capture
+        "sets": at_least_one,
+        "seed": not_negative,
+    }
 
     def measured(self, series: "Series", path: Path, *, kind: str, num_views: int) -> None:
         """Measure a series, print and write it.
@@ -58,7 +62,12 @@ class MeasuredSeries(Command):
         from deltas_nets.ablations.measure import Measurement, measure
         from deltas_nets.ablations.report import draw_series, record_of, series_tables
         from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.usable import check_all, usable_view_sets, with_depth_only
+        from deltas_nets.captures.usable import (
+            check_all,
+            sets_file,
+            usable_view_sets,
+            with_depth_only,
+        )
         from deltas_nets.evaluate.record import write_record
         from deltas_nets.evaluate.some_sets import evenly_spaced
         from deltas_nets.outputs.atomic_files import check_writable
@@ -68,7 +77,8 @@ class MeasuredSeries(Command):
         check_writable(self.out)
         device = usable_device(self.device)
         capture = open_capture(path).remembering()
-        usable = usable_view_sets(capture, self.view_sets, self.views or num_views).view_sets
+        file = sets_file(self.view_sets, path)
+        usable = usable_view_sets(capture, file, self.views or num_views).view_sets
         view_sets = tuple(evenly_spaced(with_depth_only(capture, usable), self.sets))
         check_all(capture, view_sets, with_depth=True)
         measurement = Measurement(capture, view_sets, config, self.seed)

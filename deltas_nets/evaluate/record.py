@@ -93,13 +93,13 @@ def write_record(path: Path, record: Record, *, beside: Mapping[str, Any] | None
     write_json(path, {"writer": WRITER, "format": FORMAT, **content, **(beside or {})})
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: str | Path) -> Record:
     """A record that :func:`write_record` wrote.
 
     Raises:
         UserError: the file is missing, or holds something else.
     """
-    remedy = "name a file of results that deltas wrote"
+    path, remedy = Path(path), "name a file of results that deltas wrote"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

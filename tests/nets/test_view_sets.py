@@ -12,6 +12,7 @@ from small_capture import write_view_sets
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.usable import sets_file
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
@@ -194,3 +195,14 @@ def test_chosen_sets_resemble_those_made_by_hand(shared_data: Path, name: str) -
 
     assert mean_baseline(chosen) == pytest.approx(mean_baseline(given), rel=0.25)
     assert all(len(view_set.sources) == 2 for view_set in chosen)
+
+
+def test_a_file_of_view_sets_may_lie_in_the_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    capture, file = Path("capture"), Path("sets.json")
+    assert sets_file(None, capture) is None
+    assert sets_file(file, capture) == capture / file
+    file.touch()
+    assert sets_file(file, capture) == file
