@@ -12,10 +12,11 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from deltas_nets.ablations.paper import PAPER
-from deltas_nets.evaluate.record import Record, Row, read_record
+from deltas_nets.evaluate.record import Record, Row, read_record, write_record
 
 RESULTS, PAGE = Path("docs/results"), Path("docs/results.md")
 LENGTHS = (2, 3, 4, 5, 7)
@@ -63,6 +64,8 @@ def main() -> None:
         for name, capture in zip(CAPTURES, sys.argv[2:4], strict=True):
             measure_depth(name, Path(capture))
         measure_pairs()
+        for file in (RESULTS / "depth").glob("*.json"):
+            keep_means(file)
         measure_inference(Path(sys.argv[2]))
     PAGE.write_text("\n".join(page()) + "\n", encoding="utf-8")
 
@@ -72,6 +75,13 @@ def deltas(*words: object) -> None:
     print("deltas", *words, flush=True)
     program = Path(sys.executable).with_name("deltas")
     subprocess.run([program, *map(str, words)], check=True)
+
+
+def keep_means(file: Path) -> None:
+    """Of a record of `deltas evaluate`, the means over all scenes: what the page is made of."""
+    record = read_record(file)
+    last = record.rows[-1]["scene"]
+    write_record(file, replace(record, rows=[r for r in record.rows if r["scene"] == last]))
 
 
 def measure_depth(name: str, capture: Path) -> None:

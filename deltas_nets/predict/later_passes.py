@@ -93,7 +93,8 @@ class LaterPasses:
         size = (found.depth.shape[-2], found.depth.shape[-1])
         nothing = KeypointDepths(torch.zeros(0, 2), torch.zeros(0), size)
         result = finished_map(anchor, found, nothing, of_straight)
-        return as_photographed(result, anchor, config), self._read(self.first, id).record
+        # A copy: the map stays in memory, and what is added to its record is not of the first pass.
+        return as_photographed(result, anchor, config), dict(self._read(self.first, id).record)
 
     def _from_disk(self, told: FirstMaps, id: str) -> _First:
         read = told.read(id)
