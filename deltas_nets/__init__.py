@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from deltas_nets.captures.opening import open_capture
     from deltas_nets.config import NetworkConfig
-    from deltas_nets.network.deltas import Deltas, DepthPrediction
+    from deltas_nets.network.deltas import Deltas
+    from deltas_nets.network.prediction import DepthPrediction
     from deltas_nets.weights_file import load_model
 
 __version__ = "0.1.0"
@@ -20,7 +21,7 @@ __all__ = ["Deltas", "DepthPrediction", "NetworkConfig", "load_model", "open_cap
 
 _HOMES = {
     "Deltas": "deltas_nets.network.deltas",
-    "DepthPrediction": "deltas_nets.network.deltas",
+    "DepthPrediction": "deltas_nets.network.prediction",
     "NetworkConfig": "deltas_nets.config",
     "load_model": "deltas_nets.weights_file",
     "open_capture": "deltas_nets.captures.opening",

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, depth_metrics
 from deltas_nets.losses.targets import read_nearest
-from deltas_nets.network.deltas import DepthPrediction
+from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.predict.depth_map import KeypointDepths, keypoint_depths
 
 

@@ -17,7 +17,8 @@ from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
 from deltas_nets.evaluate.points import score_points
 from deltas_nets.evaluate.scores import CaptureScores, MapScores, mean_scores, score_map
 from deltas_nets.losses.targets import read_nearest
-from deltas_nets.network.deltas import Deltas, DepthPrediction
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.rooms import Rooms
 
 EVALUATION_SEEDS, CALIBRATION_SEEDS = range(500), range(500, 1000)

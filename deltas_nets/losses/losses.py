@@ -15,8 +15,8 @@ from deltas_nets.config.lookup import look_up
 from deltas_nets.losses.divisors import WHOLE, Divisors
 from deltas_nets.losses.seen import Seen
 from deltas_nets.losses.targets import detector_labels, keypoint_targets
-from deltas_nets.network.deltas import DepthPrediction
 from deltas_nets.network.origin import moved_to_anchor
+from deltas_nets.network.prediction import DepthPrediction
 
 
 class Losses(NamedTuple):

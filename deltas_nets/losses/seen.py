@@ -7,8 +7,8 @@ from torch import Tensor
 
 from deltas_nets.losses.divisors import WHOLE, Divisors
 from deltas_nets.losses.targets import Targets
-from deltas_nets.network.deltas import DepthPrediction
 from deltas_nets.network.lite.densifier import DenseDepth
+from deltas_nets.network.prediction import DepthPrediction
 
 
 class Seen(NamedTuple):

@@ -1,22 +1,14 @@
 """DELTAS: the method whole. Start reading here."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from deltas_geom import (
-    Matches,
-    PosedViews,
-    SparseDepth,
-    Triangulation,
-    rasterize_depth,
-    triangulate,
-)
-from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
-from deltas_geom.records import Record
+from deltas_geom import PosedViews, SparseDepth, rasterize_depth, triangulate
 from deltas_nets.config import NetworkConfig
+from deltas_nets.network.batch import flat_batch, with_batch_dims
 from deltas_nets.network.build import build_stages
 from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.image_range import check_images
@@ -24,23 +16,8 @@ from deltas_nets.network.known_depth import KnownDepth, as_points, reconciled
 from deltas_nets.network.layers import upsample_to
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.densifier import DenseDepth
-from deltas_nets.network.lite.detector import Keypoints
 from deltas_nets.network.origin import moved_to_anchor
-from deltas_nets.network.records import Posterior
-
-
-class Evidence(Record):
-    """What the prediction rests on; training supervises it, notebooks show it.
-
-    Attributes:
-        confidence: ``(*B, N)`` probability that a point's depth is right.
-        posterior: belief over inverse depth.
-        dense: log depth at four scales and its spread.
-    """
-
-    confidence: Tensor
-    posterior: Posterior
-    dense: DenseDepth
+from deltas_nets.network.prediction import DepthPrediction, Evidence
 
 
 class Densified(NamedTuple):
@@ -55,33 +32,6 @@ class Densified(NamedTuple):
     dense: DenseDepth
     depth: Tensor
     std: Tensor
-
-
-class DepthPrediction(Record):
-    """Depth of the anchor, and every stage that led to it.
-
-    Attributes:
-        depth: ``(*B, 1, H, W)`` metres along z.
-        std: ``(*B, 1, H, W)`` its standard deviation, metres, calibrated if the weights are.
-        keypoints: N points of the anchor.
-        matches: where they are seen in all views.
-        points: triangulated, in the world, in the dtype of the poses if that is wider than the
-            network's.
-        sparse: their depth as an image.
-        evidence: posterior, confidence, scales.
-    """
-
-    depth: Tensor
-    std: Tensor
-    keypoints: Keypoints
-    matches: Matches
-    points: Triangulation
-    sparse: SparseDepth
-    evidence: Evidence
-
-    def confidence(self, tolerance: float = 0.05) -> Tensor:
-        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``."""
-        return KnownDepth(self.depth, self.std / self.depth).confidence(tolerance)
 
 
 class Deltas(nn.Module):
@@ -154,29 +104,20 @@ class Deltas(nn.Module):
                 values can be looked at (on the CPU, untraced), the images are not in [0, 1].
             TypeError: the images are integers.
         """
-        check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
-        check_depth_range(depth_range)
+        flat = flat_batch(images, views, depth_range)
         if refinement is not None and refinement < 1:
             raise ValueError(f"refinement must be at least 1, got {refinement}")
-        if images.shape[-4] < 2:
-            raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
-        if 0 in images.shape:
-            raise ShapeError(f"images must not be empty, got {tuple(images.shape)}")
-        batch, size = images.shape[:-4], (images.shape[-2], images.shape[-1])
-        flat = PosedViews(
-            *(t.expand(*batch, *t.shape[-3:]).reshape(-1, *t.shape[-3:]) for t in views)
-        )
         prediction = self.from_encoded(
-            self.encode(images.reshape(-1, *images.shape[-4:])),
-            flat,
+            self.encode(flat.images),
+            flat.views,
             depth_range,
-            image_size=size,
+            image_size=flat.image_size,
             num_keypoints=num_keypoints,
             shift=None if shift is None else shift.reshape(-1, 2),
             refinement=refinement,
             known=None if known is None else _flat_maps(known),
         )
-        return with_batch_dims(prediction, batch)
+        return with_batch_dims(prediction, flat.dims)
 
     def encode(self, images: Tensor) -> Encoded:
         """The part that knows one image at a time: of a video, once per frame is enough.
@@ -290,19 +231,3 @@ class Deltas(nn.Module):
 
 def _flat_maps(known: KnownDepth) -> KnownDepth:
     return KnownDepth(*(part.reshape(-1, *part.shape[-3:]) for part in known))
-
-
-def with_batch_dims(prediction: DepthPrediction, batch: torch.Size) -> DepthPrediction:
-    """Give every tensor the caller's leading dims, none or many, for its flat batch dim."""
-
-    def restore(value: Any) -> Any:
-        if isinstance(value, Tensor):
-            # Shared tables, such as the sampled inverse depths, have no batch dim.
-            return value.reshape(*batch, *value.shape[1:]) if value.ndim > 1 else value
-        if isinstance(value, tuple):
-            items = [restore(item) for item in value]
-            return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
-        return value
-
-    restored: DepthPrediction = restore(prediction)
-    return restored

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from deltas_geom import PosedViews, unproject
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.view_sets import ViewSet
-from deltas_nets.network.deltas import DepthPrediction
 from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.network.prediction import DepthPrediction
 
 
 @dataclass(frozen=True)

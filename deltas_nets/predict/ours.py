@@ -15,8 +15,10 @@ from deltas_nets.captures.work_size import anchor_views, fit_work_size
 from deltas_nets.config import to_dict
 from deltas_nets.config.varied import NetworkSettings, varied_config
 from deltas_nets.errors import UserError
-from deltas_nets.network.deltas import Deltas, DepthPrediction, with_batch_dims
+from deltas_nets.network.batch import with_batch_dims
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.predict.depth_map import (
     DepthMap,
     KeypointDepths,

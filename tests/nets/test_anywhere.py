@@ -12,7 +12,8 @@ from deltas_geom import PosedViews
 from deltas_nets import load_model
 from deltas_nets.config import LossConfig
 from deltas_nets.losses.losses import training_losses
-from deltas_nets.network.deltas import Deltas, DepthPrediction
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.rooms import render_room
 
 ROOM = render_room(6, num_views=3, image_size=(96, 128))

@@ -18,9 +18,10 @@ from deltas_geom import PosedViews, ShapeError
 from deltas_nets import load_model
 from deltas_nets.config import CONFIGS, LossConfig, NetworkConfig
 from deltas_nets.losses.losses import training_losses
-from deltas_nets.network.deltas import Deltas, DepthPrediction
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.layers import WideBatchNorm1d, WideLinear, WideRowConv
 from deltas_nets.network.lite.calibration import VIEWS, Curve, SpreadCalibration
+from deltas_nets.network.prediction import DepthPrediction
 
 IMAGES = torch.rand(2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
 

@@ -27,8 +27,9 @@ from deltas_nets.losses.losses import loss_functions, training_losses
 from deltas_nets.losses.points import confidence_loss, match_loss, point_loss, posterior_loss
 from deltas_nets.losses.seen import Seen
 from deltas_nets.losses.targets import Targets, detector_labels, keypoint_targets
-from deltas_nets.network.deltas import Deltas, DepthPrediction
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.densifier import DenseDepth
+from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.network.records import Posterior
 from deltas_nets.rooms import render_room
 

@@ -11,11 +11,12 @@ from torch import Tensor
 from deltas_geom import PosedViews, ShapeError, SparseDepth, Status
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
-from deltas_nets.network.deltas import Deltas, DepthPrediction
+from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.joint.context import Context
 from deltas_nets.network.lite.densifier import interpolate_sparse
 from deltas_nets.network.lite.detector import detector_heatmap, spread_points
 from deltas_nets.network.lite.efficientnet import EfficientNetLite0
+from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.rooms import render_room
 
 SIZE = (64, 96)

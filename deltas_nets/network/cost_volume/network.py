@@ -16,19 +16,19 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import Matches, PosedViews, SparseDepth, Triangulation
-from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
 from deltas_nets.config import NetworkConfig
 from deltas_nets.config.encoders import ENCODERS
 from deltas_nets.config.lookup import look_up
+from deltas_nets.network.batch import flat_batch, with_batch_dims
 from deltas_nets.network.cost_volume.decoder import Planes, VolumeDecoder
 from deltas_nets.network.cost_volume.volume import difference_volume
-from deltas_nets.network.deltas import DepthPrediction, Evidence, with_batch_dims
 from deltas_nets.network.image_range import check_images
 from deltas_nets.network.joint.inverse_depths import bin_centres
 from deltas_nets.network.lite.calibration import SpreadCalibration
 from deltas_nets.network.lite.densifier import DenseDepth
 from deltas_nets.network.lite.detector import CELL, Keypoints
 from deltas_nets.network.origin import moved_to_anchor
+from deltas_nets.network.prediction import DepthPrediction, Evidence
 from deltas_nets.network.records import Posterior
 
 WIDTH = 16
@@ -91,22 +91,15 @@ class CostVolume(nn.Module):
             shift: likewise.
 
         Raises:
-            ShapeError: a trailing shape differs, or there is no source.
+            ShapeError: a trailing shape differs, there is no source, or the batch is empty.
             ValueError: the depth range makes no sense, or the images are not in [0, 1].
         """
-        check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
-        check_depth_range(depth_range)
-        if images.shape[-4] < 2:
-            raise ShapeError("images must hold the anchor and at least one source (V >= 2)")
-        batch, size = images.shape[:-4], (images.shape[-2], images.shape[-1])
-        flat = PosedViews(
-            *(t.expand(*batch, *t.shape[-3:]).reshape(-1, *t.shape[-3:]) for t in views)
-        )
-        images = images.reshape(-1, *images.shape[-4:])
+        images, views, batch = flat = flat_batch(images, views, depth_range)
+        size = flat.image_size
         check_images(images)
         features = self.encoder(images.to(self.dtype))
         compared = self.compared(features.quarter.flatten(0, 1)).unflatten(0, images.shape[:2])
-        near_origin, _ = moved_to_anchor(flat, torch.promote_types(self.dtype, torch.float32))
+        near_origin, _ = moved_to_anchor(views, torch.promote_types(self.dtype, torch.float32))
         inv_depths = bin_centres(self.config.matcher.num_samples, depth_range, like=near_origin.K)
         # Geometry keeps full precision whatever the network around it runs in.
         with torch.autocast(images.device.type, enabled=False):
