@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
@@ -20,10 +19,10 @@ from deltas_nets.network.paper.sparse_densifier import (
 )
 from deltas_nets.network.paper.superpoint_head import DescriptorHead, DetectorHead
 from deltas_nets.network.paper.taps import Taps, imagenet_normalised
-from deltas_nets.reference.batch import batch_and_views
 from deltas_nets.reference.enlarge import enlarge_by_rows
 from deltas_nets.reference.features import heatmap_of, shown_features
 from deltas_nets.reference.keypoints import DetectedKeypoints, pick_keypoints
+from deltas_nets.reference.matched import matched_points
 from deltas_nets.reference.outputs import (
     DensifyOutputs,
     MatchOutputs,
@@ -31,10 +30,9 @@ from deltas_nets.reference.outputs import (
     ReferenceOutputs,
     ReferencePrediction,
 )
-from deltas_nets.reference.points import draw_sparse_depth, triangulate_pixels
+from deltas_nets.reference.points import draw_sparse_depth
 from deltas_nets.reference.precision import full_precision
-from deltas_nets.reference.scores import MatchNorm, correlate_samples, read_matches
-from deltas_nets.reference.segments import reference_segments, segment_samples
+from deltas_nets.reference.scores import MatchNorm
 from deltas_nets.reference.settings import PUBLISHED, choose_keypoints
 
 Indices = Tensor | Sequence[int]
@@ -139,36 +137,15 @@ class ReferenceNetwork(nn.Module):
         Raises:
             ShapeError: a shape differs.
         """
-        batch, views = batch_and_views(descriptors, keypoints, intrinsics, cam_from_anchor)
-        size = (CELL * descriptors.shape[-2], CELL * descriptors.shape[-1])
-        given = PUBLISHED.given() | settings.given()
-        offset: float = given["offset"]
         probe = torch.as_tensor(probe_points, dtype=torch.long, device=keypoints.device)
-        with full_precision(keypoints.device):
-            segments = reference_segments(keypoints, intrinsics, cam_from_anchor, image_size=size)
-            samples = segment_samples(segments, num_samples=given["num_samples"], offset=offset)
-            maps = descriptors.view(1 + views, batch, *descriptors.shape[1:]).transpose(0, 1)
-            correlation = correlate_samples(maps, keypoints, samples)
-            scores = self.match_norm(correlation)
-            matches = read_matches(scores, segments, offset=offset)
-            weights = F.pad(matches.weights, (0, 0, 1, 0), value=1.0)  # the anchor's is 1
-            pixels = torch.cat([keypoints[:, None], matches.pixels], dim=1)
-            points = triangulate_pixels(pixels, weights, intrinsics, cam_from_anchor)
-        return MatchOutputs(
-            project_near=segments.near,
-            project_far=segments.far,
-            in_range=segments.in_range.to(torch.uint8),
-            segment_center=segments.center,
-            segment_length=segments.length,
-            segment_angle=segments.angle,
-            probe_grid=samples[:, :, probe],
-            probe_corr=correlation[:, :, probe],
-            probe_corr_act=scores[:, :, probe],
-            matches=matches.pixels,
-            confidence=weights.mT,
-            probe_dlt=points.system[:, probe].flatten(0, 1),
-            dlt_singular_values=points.singular_values.flatten(0, 1),
-            points_3d=points.points,
+        return matched_points(
+            self.match_norm,
+            descriptors,
+            keypoints,
+            intrinsics,
+            cam_from_anchor,
+            probe=probe,
+            settings=settings,
         )
 
     @torch.no_grad()

@@ -11,7 +11,7 @@ from run_fit import CONFIG, logged, read_checkpoint, train
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom import PosedViews, project, unproject
+from deltas_geom import PosedViews, ShapeError, project, unproject
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import (
     CONFIGS,
@@ -60,6 +60,18 @@ def model() -> CostVolume:
 
 def of_one(room: PosedImages) -> PosedViews:
     return PosedViews(*(tensor[None] for tensor in room.views))
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [((1, 3, *SIZE), "at least one source"), ((0, 3, 3, *SIZE), "must not be empty")],
+    ids=str,
+)
+def test_images_that_make_no_view_set_are_an_error_in_words(
+    model: CostVolume, room: PosedImages, shape: tuple[int, ...], words: str
+) -> None:
+    with pytest.raises(ShapeError, match=words):
+        model(torch.zeros(shape), room.views)
 
 
 def test_the_volume_is_what_each_pixel_of_each_plane_says(room: PosedImages) -> None:
