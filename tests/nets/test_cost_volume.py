@@ -71,7 +71,7 @@ def test_images_that_make_no_view_set_are_an_error_in_words(
     model: CostVolume, room: PosedImages, shape: tuple[int, ...], words: str
 ) -> None:
     with pytest.raises(ShapeError, match=words):
-        model(torch.zeros(shape), room.views.select(list(range(shape[1]))))
+        model(torch.zeros(shape), room.views.select(list(range(shape[-4]))))
 
 
 def test_the_volume_is_what_each_pixel_of_each_plane_says(room: PosedImages) -> None:
