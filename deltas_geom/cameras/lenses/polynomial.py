@@ -21,7 +21,7 @@ class Polynomial(NamedTuple):
         radial: places of coefficients of r^2, r^4, ... in the numerator.
         divided: in the denominator.
         tangential: x and y.
-        prism: x and y of r^2, x and y of r^4.
+        prism: x and y of r^2, then perhaps x and y of r^4.
     """
 
     angles: bool
@@ -46,11 +46,7 @@ class Polynomial(NamedTuple):
     def terms(self, coefficients: Coefficients) -> Terms:
         """The terms of these coefficients."""
         parts = [tuple(coefficients[k] for k in places) for places in self[1:]]
-        terms = Terms(*parts)
-        if len(terms.prism) == 2:
-            nothing = torch.zeros_like(terms.prism[0])
-            terms = terms._replace(prism=(*terms.prism, nothing, nothing))
-        return terms
+        return Terms(*parts)
 
     def reach(self, coefficients: Coefficients) -> Tensor:
         """How far from the axis the model is one to one, ``(*B, 1)``."""

@@ -27,7 +27,7 @@ class Terms(NamedTuple):
         radial: of t, t^2, ... in the numerator of g.
         divided: of t, t^2, ... in its denominator.
         tangential: x and y of p, or nothing.
-        prism: x and y of s1, x and y of s2, or nothing.
+        prism: x and y of s1, then perhaps x and y of s2, or nothing.
     """
 
     radial: tuple[Tensor, ...] = ()
@@ -63,7 +63,7 @@ def gain(terms: Terms, t: Tensor) -> Pair:
 def _polynomial(coefficients: Sequence[Tensor], t: Tensor) -> Pair:
     """1 + c1 t + c2 t^2 + ... and its derivative, by Horner's scheme."""
     if not coefficients:
-        return torch.ones_like(t), torch.zeros_like(t)
+        return t.new_ones(()), t.new_zeros(())
     value, slope = coefficients[-1], None
     for coefficient in [*coefficients[-2::-1], t.new_ones(())]:
         slope = value if slope is None else torch.addcmul(value, slope, t)
@@ -74,53 +74,68 @@ def _polynomial(coefficients: Sequence[Tensor], t: Tensor) -> Pair:
 def distort(terms: Terms, x: Tensor, y: Tensor) -> Pair:
     """Where a point of the plane goes."""
     t = torch.addcmul(x * x, y, y)
-    g, _ = gain(terms, t)
-    return _moved(terms, x, y, t, g)
+    g = _turned(terms, gain(terms, t)[0], 2 * x, 2 * y)
+    shift, _ = _shift(terms, t)
+    return _moved(x, y, g, shift)
 
 
 def distort_and_derive(terms: Terms, x: Tensor, y: Tensor) -> tuple[Pair, Jacobian]:
     """Where a point of the plane goes, and the derivative by the point."""
     t = torch.addcmul(x * x, y, y)
     g, slope = gain(terms, t)
-    place = _moved(terms, x, y, t, g)
     twice_x, twice_y = 2 * x, 2 * y
-    by_x, by_y = slope * x, slope * y
-    if not terms.tangential:
-        ux, uy = torch.addcmul(g, twice_x, by_x), twice_x * by_y
-        jacobian = Jacobian(ux, uy, uy, torch.addcmul(g, twice_y, by_y))
-    else:
-        px, py = terms.tangential
-        along_x, along_y = px * twice_x, py * twice_y
-        g = g + along_x + along_y
-        ux = torch.addcmul(g + along_x, twice_x, by_x + px)
-        vy = torch.addcmul(g + along_y, twice_y, by_y + py)
-        uy = torch.addcmul(px * twice_y, twice_x, by_y + py)
-        jacobian = Jacobian(ux, uy, uy, vy)
-    if terms.prism:
-        sx1, sy1, sx2, sy2 = terms.prism
-        x_slope = torch.addcmul(sx1, sx2, 2 * t)
-        y_slope = torch.addcmul(sy1, sy2, 2 * t)
-        jacobian = Jacobian(
-            torch.addcmul(jacobian.ux, x_slope, twice_x),
-            torch.addcmul(jacobian.uy, x_slope, twice_y),
-            torch.addcmul(jacobian.vx, y_slope, twice_x),
-            torch.addcmul(jacobian.vy, y_slope, twice_y),
-        )
-    return place, jacobian
-
-
-def _moved(terms: Terms, x: Tensor, y: Tensor, t: Tensor, g: Tensor) -> Pair:
+    g = _turned(terms, g, twice_x, twice_y)
+    shift, shift_slope = _shift(terms, t)
+    # Half of the derivative of g, all of which is along u for what is radial alone.
     if terms.tangential:
         px, py = terms.tangential
-        g = g + 2 * torch.addcmul(px * x, py, y)
-        u, v = torch.addcmul(px * t, x, g), torch.addcmul(py * t, y, g)
+        by_x, by_y = torch.addcmul(px, slope, x), torch.addcmul(py, slope, y)
     else:
-        u, v = x * g, y * g
-    if terms.prism:
-        sx1, sy1, sx2, sy2 = terms.prism
-        u = torch.addcmul(u, t, torch.addcmul(sx1, sx2, t))
-        v = torch.addcmul(v, t, torch.addcmul(sy1, sy2, t))
-    return u, v
+        by_x, by_y = slope * x, slope * y
+    if not shift_slope:
+        uy = twice_x * by_y
+        jacobian = torch.addcmul(g, twice_x, by_x), uy, uy, torch.addcmul(g, twice_y, by_y)
+    else:
+        along_x, along_y = shift_slope
+        uy = torch.addcmul(along_x * twice_y, twice_x, by_y)
+        jacobian = (
+            torch.addcmul(g, twice_x, by_x + along_x),
+            uy,
+            torch.addcmul(along_y * twice_x, twice_y, by_x) if terms.prism else uy,
+            torch.addcmul(g, twice_y, by_y + along_y),
+        )
+    return _moved(x, y, g, shift), Jacobian(*jacobian)
+
+
+def _turned(terms: Terms, g: Tensor, twice_x: Tensor, twice_y: Tensor) -> Tensor:
+    """All that multiplies u: g(t) + 2 (p . u)."""
+    if not terms.tangential:
+        return g
+    px, py = terms.tangential
+    return torch.addcmul(torch.addcmul(g, px, twice_x), py, twice_y)
+
+
+def _shift(terms: Terms, t: Tensor) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """What is added to all points of a circle: (p + s1) t + s2 t^2, and its derivative by t."""
+    first = [*terms.tangential] or [*terms.prism[:2]]
+    if not first:
+        return (), ()
+    if terms.tangential and terms.prism:
+        first = [p + s for p, s in zip(first, terms.prism, strict=False)]
+    second = terms.prism[2:]
+    if not second:
+        return [a * t for a in first], first
+    pairs = list(zip(first, second, strict=True))
+    return (
+        [torch.addcmul(a, b, t) * t for a, b in pairs],
+        [torch.addcmul(a, b, t, value=2) for a, b in pairs],
+    )
+
+
+def _moved(x: Tensor, y: Tensor, g: Tensor, shift: Sequence[Tensor]) -> Pair:
+    if not shift:
+        return x * g, y * g
+    return torch.addcmul(shift[0], x, g), torch.addcmul(shift[1], y, g)
 
 
 @torch.no_grad()
@@ -151,9 +166,9 @@ def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
         if terms.tangential:
             taken[1] = taken[1] - 6 * torch.hypot(*terms.tangential)
         if terms.prism:
-            sx1, sy1, sx2, sy2 = terms.prism
-            taken[1] = taken[1] - 2 * torch.hypot(sx1, sy1)
-            taken[3] = taken[3] - 4 * torch.hypot(sx2, sy2)
+            taken[1] = taken[1] - 2 * torch.hypot(*terms.prism[:2])
+        if terms.prism[2:]:
+            taken[3] = taken[3] - 4 * torch.hypot(*terms.prism[2:])
         squared = _product(below, below)
         squared = [part for each in squared for part in (each, torch.zeros_like(one))][:-1]
         of_r = _sum(of_r, _product(taken, squared))
@@ -174,8 +189,9 @@ def image_radius(terms: Terms, within: Tensor) -> Tensor:
     if terms.tangential:
         radius = radius + 3 * torch.hypot(*terms.tangential) * t
     if terms.prism:
-        sx1, sy1, sx2, sy2 = terms.prism
-        radius = radius + torch.hypot(sx1, sy1) * t + torch.hypot(sx2, sy2) * t * t
+        radius = radius + torch.hypot(*terms.prism[:2]) * t
+    if terms.prism[2:]:
+        radius = radius + torch.hypot(*terms.prism[2:]) * t * t
     return radius * (1 + 1e-9)
 
 
