@@ -25,7 +25,10 @@ from deltas_nets.commands.train import encoder_file
 from deltas_nets.config import DataConfig, TrainConfig
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import gmacs
-from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
+from deltas_nets.evaluate.room_scores import score_rooms
+from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms
+from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.train.data_sets import training_data
 from deltas_nets.train.fit import fit
 from deltas_nets.train.start import Start
@@ -134,7 +137,8 @@ def measure(variant: Variant, shared: TrainConfig, rooms: list[PosedImages]) -> 
         model = load_model(fit(config, Path(name), Start(encoder), checkpoint_every=10**9))
         # Of the processor: what else the machine is doing must not look like a variant's cost.
         cpu_seconds = time.process_time() - began
-    scores = score_rooms(model, rooms, depth_range=DEPTH_RANGE)
+    config = PredictConfig(DEPTH_RANGE, work_size=SIZE)
+    scores = score_rooms(DeltasPredictor(model), rooms, config)
     assert scores.sparse is not None, "no point has a true depth"
     cost = cost_of(model, VIEWS, SIZE, config.network.detector.num_keypoints, repeats=1).total
     return {

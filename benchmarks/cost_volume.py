@@ -24,7 +24,9 @@ from deltas_nets.commands.train import encoder_file
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import gmacs
-from deltas_nets.evaluate.rooms import score_rooms
+from deltas_nets.evaluate.room_scores import score_rooms
+from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.predictor import load_predictor
 from deltas_nets.train.fit import fit
 from deltas_nets.train.start import Start
 from deltas_nets.train.step import DEPTH_RANGE
@@ -65,7 +67,8 @@ def trained(name: str, shared: TrainConfig, folder: Path) -> dict[str, float]:
 def scored(file: Path, rooms: list[PosedImages], num_keypoints: int) -> dict[str, float]:
     """Cost, and errors of dense maps."""
     model = load_network(file)
-    scores = score_rooms(model, rooms, depth_range=DEPTH_RANGE)
+    config = PredictConfig(DEPTH_RANGE, work_size=SIZE)
+    scores = score_rooms(load_predictor(file), rooms, config)
     cost = cost_of(model, VIEWS, SIZE, num_keypoints, repeats=5)
     return {
         "parameters": cost.total.parameters,

@@ -86,7 +86,7 @@ def flicker(capture: Capture, folder: Path, ids: list[str]) -> str:
         frame = capture.frame(id)
         maps.add(frame, read_depth_map(folder, id, scale), depth_at_image(frame))
     found = maps.result()
-    return f"{found.flicker:.4f} ({found.successive})" if found.successive else "no pair"
+    return f"{found.flicker:.4f} ({found.successive})" if found.flicker is not None else "no pair"
 
 
 def edges(depth: Map) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from deltas_geom.cameras.pixels import resize_pixels
 from deltas_nets.baselines.colmap_points import colmap, sparse_points
-from deltas_nets.baselines.densified import densified
+from deltas_nets.baselines.densified import densified, densifier_record
 from deltas_nets.baselines.named import Named
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.measured import MeasuredDepth
@@ -75,6 +75,10 @@ class SparseDensified(Named):
         """Depth of the first frame; the others give points."""
         self.refuse_measured(frames, measured)
         return densified(self.encode, frames, config, sparse_points(frames, config.depth_range))
+
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """Of the densifier."""
+        return densifier_record(name_or_file)
 
 
 def interpolated(

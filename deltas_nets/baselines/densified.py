@@ -11,6 +11,19 @@ from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import work_size_of
+from deltas_nets.weights_file import weights_record
+
+
+def densifier_record(name: str) -> dict[str, str]:
+    """What identifies a baseline that rests on the densifier of `deltas-small`.
+
+    Args:
+        name: as `--weights` takes it. The fingerprint is under another name than in records of
+            networks: one file makes several baselines.
+    """
+    of_network = weights_record("deltas-small")
+    origin = "the densifier of deltas-small"
+    return {"name": name, "origin": origin, "densifier_sha256": of_network["sha256"]}
 
 
 @torch.inference_mode()

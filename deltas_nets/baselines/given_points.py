@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from deltas_geom.cameras.pixels import resize_pixels
-from deltas_nets.baselines.densified import densified
+from deltas_nets.baselines.densified import densified, densifier_record
 from deltas_nets.baselines.named import Named
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
@@ -51,6 +51,10 @@ class TruePoints(Named):
                 raise UserError(what, capture.path, "use other weights")
         self._capture = capture
 
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """Of the densifier."""
+        return densifier_record(name_or_file)
+
     @torch.inference_mode()
     def depth_map(
         self,
@@ -79,9 +83,19 @@ class TruePoints(Named):
         return densified(self.encode, frames, config, points)
 
 
-def no_points(device: str | torch.device = "cpu") -> DeltasPredictor:
-    """`deltas-small` without any point: one image, and depth as it mostly is in rooms."""
-    return DeltasPredictor(load_model(device=device), without_points=True)
+class NoPoints(DeltasPredictor):
+    """`deltas-small` without any point: one image, and depth as it mostly is in rooms.
+
+    Args:
+        device: where to compute.
+    """
+
+    def __init__(self, device: str | torch.device = "cpu") -> None:
+        super().__init__(load_model(device=device), without_points=True)
+
+    def weights_record(self, name_or_file: str) -> dict[str, str]:
+        """Of the densifier."""
+        return densifier_record(name_or_file)
 
 
 def _nearest(pixels: torch.Tensor, seen: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:

@@ -105,7 +105,9 @@ def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[V
         views for views in view_sets if capture.frame(views.anchor).depth_path is not None
     )
     if not found:
-        raise UserError("the capture has no sensor depth", capture.path, "add depth/N.png")
+        robust_mvd = capture.layout == "Robust MVD"
+        remedy = f"add {'key/depth.npy' if robust_mvd else 'depth/N.png'}"
+        raise UserError("the capture has no sensor depth", capture.path, remedy)
     if len(found) < len(view_sets):
         warn(f"{len(view_sets) - len(found)} anchors without sensor depth are not scored")
     return found

@@ -89,7 +89,10 @@ def choose_views(
         what = f"{num_views} views are too few"
         raise UserError(what, "--views", "use 2 or more: the anchor and a source")
     if len(capture.frames) < 2:
-        what = f"the capture has one frame with a usable pose ({ids_in_words(capture.frames)})"
+        what = f"one frame of the capture can be used ({ids_in_words(capture.frames)})"
+        for words in ("no image", "no pose"):
+            ids = [id for id, lost in capture.lost.items() if lost.reason == words]
+            what += f"; {words}: {ids_in_words(ids)}" if ids else ""
         raise UserError(what, capture.path, "depth from views needs two frames or more")
     ids = list(capture.frames)
     index_of = {id: index for index, id in enumerate(ids)}

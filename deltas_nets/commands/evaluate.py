@@ -54,6 +54,8 @@ class Evaluate(Prediction):
     """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; of several scenes, a file in each."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Views per depth map, the anchor included; 3 of rooms and protocols if not given."""
+    sets: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """So many view sets of each scene, spread over all; every one if not given."""
     gap: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Of --protocol paper: frames from one view to the next; the paper's for its number of views if
     not given (20 for 2 and 3, 15, 12, 10 for 4, 5, 7)."""
@@ -79,6 +81,7 @@ class Evaluate(Prediction):
     # A file of view sets may lie in each scene, and is looked for once these are known.
     checks: ClassVar[Mapping[str, Callable[[Any, str], object]]] = {
         "gap": at_least_one,
+        "sets": at_least_one,
         "every": at_least_one,
         "view_sets": lambda value, flag: None,
     }
@@ -147,7 +150,9 @@ class Evaluate(Prediction):
         predictions = self.predictions
         if predictions is not None and many:
             predictions = predictions / name
-        return ViewProtocol(self.protocol, self.views, self.gap, self.every, file, predictions)
+        return ViewProtocol(
+            self.protocol, self.views, self.gap, self.every, file, predictions, self.sets
+        )
 
     def _scorer(self, *, many: bool) -> Any:
         """What scores a scene: the network, or maps in files."""
@@ -190,12 +195,14 @@ class Evaluate(Prediction):
     def _of_rooms(self) -> tuple["DatasetScores", str]:
         from deltas_nets.evaluate.dataset import DatasetScores
         from deltas_nets.evaluate.protocols.view_protocol import VERSION, SceneViews
-        from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
+        from deltas_nets.evaluate.room_scores import score_rooms
+        from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms
 
         config, views, count = self.config(), self.views or 3, self.rooms or 0
-        for given, name in ((self.view_sets, "--view-sets"), (self.predictions, "--predictions")):
-            if given is not None:
-                raise UserError("rooms have none", name, "leave it out")
+        for name in ("view_sets", "sets", "predictions"):
+            if getattr(self, name) is not None:
+                flag = f"--{name.replace('_', '-')}"
+                raise UserError("rooms have none", flag, "leave it out")
         if self.protocol != "chosen" or self.consistency or self.truth_size != "map":
             what = "rooms are sets of views, each by itself, with truth at every pixel"
             raise UserError(what, "--rooms", "leave out --protocol, --consistency, --truth-size")
@@ -203,8 +210,6 @@ class Evaluate(Prediction):
             raise UserError(f"no {count} rooms", "--rooms", f"give 1 to {len(EVALUATION_SEEDS)}")
         if not 2 <= views <= 12:
             raise UserError(f"no rooms of {views} views", "--views", "give 2 to 12")
-        what = "the reference network has one camera, and rooms have others"
-        model = self.network.deltas(what, self.weights, "name a capture")
         rooms = held_out_rooms(
             count,
             EVALUATION_SEEDS,
@@ -213,7 +218,7 @@ class Evaluate(Prediction):
             conditions=self.conditions,
         )
         with progress("evaluate", count) as report:
-            scores = score_rooms(model, rooms, depth_range=self.range, report=report)
+            scores = score_rooms(self.network, rooms, config, report=report)
         rule = {"name": "rooms", "version": VERSION, "views": views, "conditions": self.conditions}
         found = SceneViews((), rule)
         return DatasetScores({"rooms": scores}, {"rooms": found}, {}, scores), (

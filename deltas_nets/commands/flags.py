@@ -32,7 +32,8 @@ class Prediction(Command):
     weights: str = "deltas-small"
     """A shipped network, a weights file of `deltas train`, or the checkpoint that the paper's
     authors published; or a baseline: plane-sweep, colmap-sparse, colmap-densified, true-points,
-    no-points (these two kinds are for depth and evaluate, and state no confidence)."""
+    no-points (checkpoint and baselines are for depth, evaluate, ablate and robustness; of these
+    only no-points states a confidence)."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda, cuda:1, mps."""
     precision: Literal["float32", "bfloat16"] = "float32"

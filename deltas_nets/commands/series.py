@@ -22,7 +22,7 @@ class MeasuredSeries(Command):
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = field(kw_only=True)
     """Folder for NAME.json, NAME.png and NAME.jsonl, which remembers what is done."""
     weights: tuple[str, ...] = ("deltas-small",)
-    """Networks: shipped names, files of `deltas train`, the published checkpoint."""
+    """Networks: shipped names, files of `deltas train`, the published checkpoint, baselines."""
     view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen if not given."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None

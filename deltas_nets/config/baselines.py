@@ -5,7 +5,7 @@ BASELINES = {
     "colmap-sparse": "colmap:SparseInterpolated",
     "colmap-densified": "colmap:SparseDensified",
     "true-points": "given_points:TruePoints",
-    "no-points": "given_points:no_points",
+    "no-points": "given_points:NoPoints",
 }
 """Name to "module:what" in `deltas_nets.baselines`; called with the device each is a `Predictor`.
 

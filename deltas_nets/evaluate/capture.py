@@ -72,16 +72,37 @@ def evaluate_network(
     Raises:
         UserError: all frames fail, or no anchor has true depth in range.
     """
-    reach = Reach(*config.depth_range)
 
     def predicted(views: ViewSet) -> _Scored:
-        found = look(predictor, frames_of(capture, views), config, reach)
-        size = (found.depth.shape[0], found.depth.shape[1])
-        std = None if found.log_std is None else np.exp(resized(found.log_std, size))
-        return _Scored(found.depth, found.keypoints, std)
+        return _predicted(predictor, capture, views, config)
 
     scoring = scoring or Scoring(config.depth_range)
     return _evaluate(predicted, capture, view_sets, scoring, meter, report)
+
+
+def score_view_set(
+    predictor: Predictor,
+    capture: Capture,
+    views: ViewSet,
+    config: PredictConfig,
+    scoring: Scoring,
+    meter: CalibrationMeter,
+) -> MapScores | None:
+    """Predict one view set and score it; None where no true depth is in range.
+
+    Args:
+        predictor: of a trained network, or a baseline.
+        capture: frames with sensor depth.
+        views: anchor and sources.
+        config: as for prediction.
+        scoring: how.
+        meter: takes in the map, if it states a deviation.
+
+    Raises:
+        UserError: an image or depth cannot be read, or the predictor refuses.
+    """
+    truth = Truth.of(capture.frame(views.anchor), scoring.truth_size)
+    return _score(_predicted(predictor, capture, views, config), truth, scoring, meter)
 
 
 def evaluate_files(
@@ -113,6 +134,15 @@ def evaluate_files(
         return _Scored(read_depth_map(predictions, views.anchor, scale), None, None)
 
     return _evaluate(read, capture, view_sets, scoring or Scoring(depth_range), None, report)
+
+
+def _predicted(
+    predictor: Predictor, capture: Capture, views: ViewSet, config: PredictConfig
+) -> _Scored:
+    found = look(predictor, frames_of(capture, views), config, Reach(*config.depth_range))
+    size = (found.depth.shape[0], found.depth.shape[1])
+    std = None if found.log_std is None else np.exp(resized(found.log_std, size))
+    return _Scored(found.depth, found.keypoints, std)
 
 
 def _evaluate(

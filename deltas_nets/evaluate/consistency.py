@@ -39,7 +39,7 @@ Places = NDArray[np.intp]
 
 
 class Consistency(NamedTuple):
-    """Of the maps of a scene; NaN where no two of them see the same.
+    """Of the maps of a scene; None where no two of them see the same.
 
     Attributes:
         agreement: share of the pixels that a neighbouring map sees at the same depth, to 5 %: of a
@@ -53,10 +53,10 @@ class Consistency(NamedTuple):
         successive: pairs of frames that share 500 places or more.
     """
 
-    agreement: float
-    truth: float
+    agreement: float | None
+    truth: float | None
     pairs: int
-    flicker: float
+    flicker: float | None
     successive: int
 
 
@@ -211,6 +211,6 @@ def _log_error(depth: Map, truth: Map) -> NDArray[np.float64]:
     return log
 
 
-def _mean(values: Sequence[float]) -> float:
+def _mean(values: Sequence[float]) -> float | None:
     finite = [value for value in values if np.isfinite(value)]
-    return float(np.mean(finite)) if finite else float("nan")
+    return float(np.mean(finite)) if finite else None

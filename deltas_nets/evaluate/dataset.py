@@ -79,7 +79,7 @@ def evaluate_scenes(
             rule = protocol(name, path)
             found = rule.of(capture)
             warn_of(capture, found.view_sets, rule.file or rule.predictions, depth_range)
-            found = found._replace(view_sets=with_depth_only(capture, found.view_sets))
+            found = rule.some_of(with_depth_only(capture, found.view_sets), found.record)
             scores[name], views[name] = score(name, capture, found, meter), found
         except UserError as error:
             failed[name] = error

@@ -5,8 +5,10 @@ is flat, so that a table, a figure or a spreadsheet can be made of it without kn
 """
 
 import json
+import math
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -79,7 +81,7 @@ class Record:
 
 
 def write_record(path: Path, record: Record, *, beside: Mapping[str, Any] | None = None) -> None:
-    """Write a record, atomically; values that JSON has not, as NaN, become null in rows.
+    """Write a record, atomically; numbers that JSON has not, as NaN, become null.
 
     Args:
         path: the file.
@@ -90,7 +92,8 @@ def write_record(path: Path, record: Record, *, beside: Mapping[str, Any] | None
         UserError: the system refuses.
     """
     content = asdict(record) | {"rows": [finite(row) for row in record.rows]}
-    write_json(path, {"writer": WRITER, "format": FORMAT, **content, **(beside or {})})
+    more = {name: _with_null(value) for name, value in (beside or {}).items()}
+    write_json(path, {"writer": WRITER, "format": FORMAT, **content, **more})
 
 
 def read_record(path: str | Path) -> Record:
@@ -137,17 +140,20 @@ def finite(row: Row) -> dict[str, Value]:
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """The command as anybody may read it: of absolute paths the last name stays.
+    """The command as a shell takes it, in the folder where it was given.
+
+    Of absolute paths in that folder the way from it stays, and of others the last name alone, for
+    which whoever runs it again puts a folder or a link of that name there.
 
     Args:
         arguments: with the program's name first; those of this process if not given.
 
     Example:
-        >>> command_line(["/opt/bin/deltas", "evaluate", "/data/hololens", "--views", "3"])
-        'deltas evaluate hololens --views 3'
+        >>> command_line(["/opt/bin/deltas", "evaluate", "/data/the walk", "--views", "3"])
+        "deltas evaluate 'the walk' --views 3"
     """
-    given = sys.argv if arguments is None else arguments
-    return " ".join(_shown(argument) for argument in given)
+    program, *given = sys.argv if arguments is None else arguments
+    return shlex.join([Path(program).name, *map(_shown, given)])
 
 
 def versions(*more: str) -> dict[str, str]:
@@ -182,8 +188,20 @@ def machine(device: str = "cpu") -> dict[str, Any]:
 def _shown(argument: str) -> str:
     flag, equals, value = argument.partition("=")
     if equals and os.path.isabs(value):
-        return f"{flag}={Path(value).name}"
-    return Path(argument).name if os.path.isabs(argument) else argument
+        return f"{flag}={_shown(value)}"
+    if not os.path.isabs(argument):
+        return argument
+    here, path = Path.cwd(), Path(os.path.normpath(argument))
+    return str(path.relative_to(here)) if path.is_relative_to(here) else path.name
+
+
+def _with_null(value: object) -> object:
+    """The same, with None for numbers that are not finite, however deep."""
+    if isinstance(value, Mapping):
+        return {name: _with_null(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_null(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _processor() -> str:

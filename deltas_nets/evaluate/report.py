@@ -1,5 +1,6 @@
 """Metrics as tables for people."""
 
+import math
 from collections.abc import Mapping
 
 from rich.box import SIMPLE_HEAD
@@ -33,7 +34,7 @@ def metrics_table(columns: Mapping[str, DepthMetrics], *, title: str) -> Table:
     for name in columns:
         table.add_column("\n".join(name.rsplit(" ", 1)), justify="right")
     for key, label in NAMES.items():
-        table.add_row(label, *(f"{getattr(metrics, key):.3f}" for metrics in columns.values()))
+        table.add_row(label, *(_number(getattr(metrics, key)) for metrics in columns.values()))
     return table
 
 
@@ -45,7 +46,7 @@ def scenes_table(scores: DatasetScores, *, title: str) -> Table:
         table.add_column(name, justify="right")
     for name, scene in {**scores.scenes, "all": scores.total}.items():
         shown = ("abs_rel", "abs_diff", "delta1", "coverage")
-        numbers = (f"{getattr(scene.dense, key):.3f}" for key in shown)
+        numbers = (_number(getattr(scene.dense, key)) for key in shown)
         table.add_row(name, str(len(scene.maps)), str(len(scene.failed)), *numbers)
     for name in scores.failed:
         table.add_row(name, "0", "all", *4 * ("",))
@@ -82,9 +83,9 @@ def sparsification_line(calibration: Calibration) -> str:
 def consistency_line(found: Consistency) -> str:
     """What maps of a scene say of each other."""
     return (
-        f"pixels that agree to 5 % with a neighbouring map: {found.agreement:.3f}, of the true "
-        f"depth {found.truth:.3f} ({found.pairs} pairs); flicker of successive maps "
-        f"{found.flicker:.4f} ({found.successive} pairs)"
+        f"pixels that agree to 5 % with a neighbouring map: {_number(found.agreement)}, of the "
+        f"true depth {_number(found.truth)} ({found.pairs} pairs); flicker of successive maps "
+        f"{_number(found.flicker, 4)} ({found.successive} pairs)"
     )
 
 
@@ -97,3 +98,8 @@ def scores_by_name(scores: CaptureScores) -> dict[str, DepthMetrics]:
         "scale and shift": scores.fitted,
     }
     return rows if scores.sparse is None else rows | {"sparse points": scores.sparse}
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    """As tables have it; a dash for what could not be measured."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -14,8 +14,6 @@ from deltas_nets.datasets.augment import Photometry, disturb_poses, draw_pose_er
 from deltas_nets.datasets.workers import rendered_ahead
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
-from deltas_nets.evaluate.points import score_points
-from deltas_nets.evaluate.scores import CaptureScores, MapScores, mean_scores, score_map
 from deltas_nets.losses.targets import read_nearest
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.prediction import DepthPrediction
@@ -89,27 +87,6 @@ def held_out_rooms(
     return DisturbedRooms(rooms) if conditions == "real" else rooms
 
 
-def score_rooms(
-    model: Deltas,
-    rooms: RoomViews,
-    *,
-    depth_range: tuple[float, float],
-    report: Callable[[str], None] = lambda _: None,
-) -> CaptureScores:
-    """Score the maps of all rooms, view 0 of each as anchor; rooms are named by their number."""
-    meter, scores = CalibrationMeter(), dict[str, MapScores | None]()
-    for number, room in enumerate(_in_order(rooms)):
-        prediction = predict_room(model, room, depth_range)
-        truth = room.depth[0].numpy()
-        depth = prediction.depth[0].cpu().numpy()
-        sparse = score_points(prediction, truth, depth_range)
-        std = (prediction.std / prediction.depth)[0].cpu().numpy()
-        scores[str(number)] = score_map(depth, truth, depth_range, sparse, std)
-        _measure(prediction, room, meter, depth_range)
-        report(str(number))
-    return mean_scores(scores, None if meter.empty else meter.result())
-
-
 def measure_rooms(
     model: Deltas,
     rooms: RoomViews,
@@ -119,12 +96,13 @@ def measure_rooms(
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Let a meter look at the maps of all rooms."""
-    for number, room in enumerate(_in_order(rooms)):
+    for number, room in enumerate(in_order(rooms)):
         _measure(predict_room(model, room, depth_range), room, meter, depth_range)
         report(str(number))
 
 
-def _in_order(rooms: RoomViews) -> Iterable[PosedImages]:
+def in_order(rooms: RoomViews) -> Iterable[PosedImages]:
+    """All of them, rendered by other processes where they are not in memory."""
     if isinstance(rooms, Dataset):
         return rendered_ahead(rooms, len(rooms))
     return (rooms[number] for number in range(len(rooms)))  # in memory

@@ -14,6 +14,7 @@ from small_capture import write_capture
 
 from deltas_nets.commands.evaluate import Evaluate
 from deltas_nets.evaluate.record import read_record
+from deltas_nets.evaluate.room_scores import room_in_files
 from deltas_nets.evaluate.scenes import named_scenes, scenes_in
 from deltas_nets.rooms import render_room
 
@@ -203,6 +204,18 @@ def test_pairs_as_dpsnet_prepared_them_are_scored_both_ways(
     ]
     assert said["metrics"]["dense"]["coverage"] == 1
     assert said["metrics"]["dense"]["abs_rel"] < 0.5
+    (pairs / "room_000" / "0001.jpg").unlink()
+    lacks = "one frame of the capture can be used (0000); no image: 0001"
+    assert_one_line(evaluated.run("evaluate", pairs / "room_000"), lacks)
+
+
+def test_a_sample_of_robust_mvd_says_which_file_its_truth_would_be(
+    run: Run, tmp_path: Path
+) -> None:
+    room_in_files(render_room(2, num_views=2, image_size=(48, 64)), tmp_path / "sample")
+    (tmp_path / "sample" / "key" / "depth.npy").unlink()
+    (tmp_path / "sample" / "source" / "1" / "depth.npy").unlink()
+    assert_one_line(run("evaluate", tmp_path / "sample"), "add key/depth.npy")
 
 
 def test_maps_in_files_are_scored_scene_by_scene(
@@ -241,6 +254,30 @@ def test_view_sets_may_lie_in_each_scene(two_scenes: Path, evaluated: Evaluated)
     assert [(f["scene"], f["frame"]) for f in said["frames"]] == [("a", "1"), ("b", "1")]
     alone = evaluated(two_scenes / "b", "--view-sets", "sets.json")
     assert alone["abs_rel_by_frame"]["1"] == said["abs_rel_by_frame"]["b/1"]
+
+
+def test_some_sets_of_each_scene_are_spread_over_all(
+    two_scenes: Path, evaluated: Evaluated, run: Run
+) -> None:
+    said = evaluated(two_scenes, "--views", 2, "--sets", 2)
+    assert [(f["scene"], f["frame"]) for f in said["frames"]] == [
+        ("a", "0"),
+        ("a", "1"),
+        ("b", "0"),
+        ("b", "1"),
+    ]
+    assert said["protocol"]["views"]["sets"] == 2
+    assert [scene["view_sets"] for scene in said["data"]] == [2, 2]
+    assert_one_line(run("evaluate", two_scenes, "--sets", 0), "--sets 0")
+
+
+def test_what_was_not_measured_is_a_dash_and_null(
+    make_capture: MakeCapture, evaluated: Evaluated
+) -> None:
+    said = evaluated(make_capture(2), "--sets", 1, "--consistency")
+    assert said["consistency"]["flicker"] is None
+    assert "flicker of successive maps - (0 pairs)" in evaluated.told.out
+    assert "nan" not in (evaluated.folder / "scores.json").read_text().lower()
 
 
 def test_what_the_supplement_varies_is_a_flag(

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,23 @@ def test_a_row_is_flat() -> None:
 def test_the_command_names_no_folder_of_the_machine() -> None:
     said = command_line(["/a/b/deltas", "detectors", "/data/walk", "sift=/x/y.pth", "runs/w.pth"])
     assert said == "deltas detectors walk sift=y.pth runs/w.pth"
+
+
+def test_a_shell_reads_the_command_as_it_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = ["evaluate", "captures/the walk", "--json", "results/walk.json"]
+    absolute = [given[0], str(tmp_path / given[1]), given[2], f"{tmp_path}/./{given[3]}"]
+    for written in (given, absolute):
+        assert shlex.split(command_line([".venv/bin/deltas", *written])) == ["deltas", *given]
+
+
+def test_what_stands_beside_a_table_has_null_for_what_is_no_number(tmp_path: Path) -> None:
+    beside = {"scenes": {"walk": [{"ause": math.nan}, (math.inf, 1.5)]}}
+    write_record(tmp_path / "record.json", Record("depth"), beside=beside)
+    read = json.loads((tmp_path / "record.json").read_text())
+    assert read["scenes"] == {"walk": [{"ause": None}, [None, 1.5]]}
 
 
 @pytest.mark.parametrize(

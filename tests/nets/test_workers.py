@@ -8,8 +8,10 @@ import torch
 
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.datasets.workers import rendered_ahead
-from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, score_rooms
-from deltas_nets.weights_file import load_model
+from deltas_nets.evaluate.room_scores import score_rooms
+from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms
+from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.predictor import load_predictor
 
 SIZE = (48, 64)
 
@@ -40,8 +42,8 @@ def test_who_stops_asking_leaves_no_process_behind() -> None:
 
 
 def test_scores_are_those_of_rooms_in_memory() -> None:
-    model = load_model()
+    network, config = load_predictor("deltas-small"), PredictConfig(work_size=SIZE)
     rooms = held_out_rooms(2, EVALUATION_SEEDS, num_views=2, image_size=SIZE)
     kept = [rooms[number] for number in range(2)]
-    ahead = score_rooms(model, rooms, depth_range=(0.5, 10.0))
-    assert ahead.dense == score_rooms(model, kept, depth_range=(0.5, 10.0)).dense
+    ahead = score_rooms(network, rooms, config)
+    assert ahead.dense == score_rooms(network, kept, config).dense

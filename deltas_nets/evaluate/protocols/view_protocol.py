@@ -1,5 +1,6 @@
 """The view sets of a scene by a rule that has a name and a version."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -8,6 +9,7 @@ from deltas_nets.captures.usable import usable_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.evaluate.protocols.deep_video import deep_video_view_sets
 from deltas_nets.evaluate.protocols.fixed_gap import fixed_gap_view_sets, gap_of
+from deltas_nets.evaluate.some_sets import evenly_spaced
 from deltas_nets.outputs.summary import recorded_view_sets
 
 __all__ = ["PROTOCOLS", "ProtocolName", "SceneViews", "ViewProtocol"]
@@ -43,6 +45,7 @@ class ViewProtocol(NamedTuple):
         every: of "paper": anchors are frames whose number it divides.
         file: of view sets, instead of a rule.
         predictions: a folder of `deltas depth` whose own sets count if there is no other rule.
+        sets: so many of each scene, spread over all; every one if None.
     """
 
     name: ProtocolName = "chosen"
@@ -51,6 +54,7 @@ class ViewProtocol(NamedTuple):
     every: int = 20
     file: Path | None = None
     predictions: Path | None = None
+    sets: int | None = None
 
     def of(self, capture: Capture) -> SceneViews:
         """The view sets of a scene.
@@ -75,3 +79,8 @@ class ViewProtocol(NamedTuple):
         name = "chosen" if self.file is None else "file"
         sets = usable_view_sets(capture, self.file, self.views).view_sets
         return SceneViews(sets, {"name": name} | version | {"views": self.views})
+
+    def some_of(self, view_sets: Sequence[ViewSet], record: dict[str, Any]) -> SceneViews:
+        """Of a scene's sets that can be scored, as many as are asked for; the record says so."""
+        more = {} if self.sets is None else {"sets": self.sets}
+        return SceneViews(tuple(evenly_spaced(view_sets, self.sets)), record | more)
