@@ -18,7 +18,7 @@ ABOVE = {
     ),
     "deltas_nets": (
         "errors terminal config captures network check outputs weights_file losses reference rooms "
-        "datasets cost fuse agree predict baselines distill evaluate ablations page view teachers "
+        "datasets cost agree fuse predict baselines distill evaluate ablations page view teachers "
         "export train commands cli"
     ),
 }

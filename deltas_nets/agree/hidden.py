@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from deltas_geom import PosedViews
-from deltas_geom.cameras.poses import invert_pose
 from deltas_nets.agree.consensus import TOLERANCE, precision
 from deltas_nets.agree.heard import Heard
-from deltas_nets.agree.seen_from import NEAREST
+from deltas_nets.agree.other_image import hit, motion
 from deltas_nets.network.known_depth import KnownDepth
 
 SAME = 0.16
@@ -76,9 +75,7 @@ def votes(depth: Tensor, index: Tensor, anchor: PosedViews, others: Sequence[Hea
     pixels = torch.stack([index % width, index // width, torch.ones_like(index)]).to(depth)
     found = Votes(torch.zeros_like(z), torch.zeros_like(z))
     for maps, views in others:
-        relative = views.cam_from_world @ invert_pose(anchor.cam_from_world)
-        turn = (views.K @ relative[:, :3, :3] @ anchor.K.inverse()).to(depth)
-        shift = (views.K @ relative[:, :3, 3:]).to(depth)
+        turn, shift = motion(anchor, views, like=depth)
         one = _votes(maps, (turn @ pixels) * z + shift)
         found = Votes(found.support + one.support, found.against + one.against)
     return found
@@ -86,12 +83,9 @@ def votes(depth: Tensor, index: Tensor, anchor: PosedViews, others: Sequence[Hea
 
 def _votes(maps: KnownDepth, points: Tensor) -> Votes:
     """Of points ``(V, 3, N)`` in the maps' cameras, in pixels times depth."""
-    height, width = maps.depth.shape[-2:]
     x, y, z = points.unbind(dim=1)
-    per_depth = 1 / z.clamp_min(NEAREST)
-    column, row = (x * per_depth + 0.5).floor(), (y * per_depth + 0.5).floor()
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > NEAREST)
-    place = torch.where(inside, row * width + column, 0).long()
+    size = (maps.depth.shape[-2], maps.depth.shape[-1])
+    place, inside = hit(x, y, z, image_size=size)
     there = maps.depth.flatten(1).gather(1, place)
     known = inside & (there > 0)
     off = torch.where(known, there, 1.0).log() - torch.where(known, z, 1.0).log()

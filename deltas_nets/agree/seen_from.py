@@ -5,10 +5,8 @@ from torch import Tensor
 
 from deltas_geom import PosedViews
 from deltas_geom.cameras.pixels import pixel_grid
-from deltas_geom.cameras.poses import invert_pose
+from deltas_nets.agree.other_image import hit, motion
 from deltas_nets.network.known_depth import KnownDepth
-
-NEAREST = 1e-6
 
 
 def seen_from(
@@ -32,23 +30,15 @@ def seen_from(
 
     Returns:
         ``(V, 1, *image_size)``.
-
-    Source: Hartley and Zisserman, 2nd ed., section 9.2: x' ~ K' R K^-1 x + K' t / depth.
     """
     count, _, height, width = maps.depth.shape
-    # In float64, and relative: with the world's origin kilometres away the sums would cancel.
-    relative = anchor.cam_from_world @ invert_pose(views.cam_from_world)
-    turn = (anchor.K @ relative[:, :3, :3] @ views.K.inverse()).to(maps.depth)
-    shift = (anchor.K @ relative[:, :3, 3:]).to(maps.depth)
+    turn, shift = motion(views, anchor, like=maps.depth)
     grid = pixel_grid((height, width), dtype=maps.depth.dtype).to(maps.depth)
     homogeneous = torch.cat([grid, torch.ones_like(grid[:, :1])], dim=-1).mT
     depth = maps.depth.reshape(count, 1, -1)
     x, y, z = ((turn @ homogeneous).mul_(depth).add_(shift)).unbind(dim=1)
-    per_depth = 1 / z.clamp_min(NEAREST)
-    column, row = (x * per_depth).add_(0.5).floor_(), (y * per_depth).add_(0.5).floor_()
-    inside = (column >= 0) & (column < image_size[1]) & (row >= 0) & (row < image_size[0])
-    inside &= (depth[:, 0] > 0) & (z > NEAREST)
-    return _nearest(maps, z, row.mul_(image_size[1]).add_(column), inside, image_size)
+    place, inside = hit(x, y, z, image_size=image_size)
+    return _nearest(maps, z, place, inside & (depth[:, 0] > 0), image_size)
 
 
 def _nearest(
@@ -65,7 +55,7 @@ def _nearest(
     """
     count, size = len(z), image_size[0] * image_size[1]
     first = torch.arange(count, device=z.device)[:, None] * size
-    place = (place.long() + first)[inside]
+    place = (place + first)[inside]
     z, deviation = z[inside], maps.deviation.reshape(count, -1)[inside]
     depth = z.new_full((count * size,), torch.inf).scatter_reduce_(0, place, z, "amin")
     wins = z == depth[place]

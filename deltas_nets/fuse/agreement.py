@@ -6,11 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_nets.agree.other_image import hit
 from deltas_nets.fuse.depth_view import DepthView
 
 __all__ = ["Agreement", "agreeing", "agreement"]
-
-NEAREST = 1e-6
 
 
 class Agreement(NamedTuple):
@@ -41,14 +40,8 @@ def agreement(view: DepthView, others: Sequence[DepthView], deviations: float = 
         # Relative poses first: with the world's origin kilometres away the sums would cancel.
         proj = (other.K @ (other.cam_from_world @ view.world_from_cam)[:3]).to(points)
         x, y, z = (proj[:, :3] @ points + proj[:, 3:]).view(3, *known.shape)
-        per_depth = z.clamp_min(NEAREST).reciprocal()
-        height, width = other.image_size
-        column, row = (x * per_depth).add_(0.5).floor_(), (y * per_depth).add_(0.5).floor_()
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > NEAREST)
-        column, row = column.clamp_(0, width - 1).long(), row.clamp_(0, height - 1).long()
-        pixel = row.mul_(width).add_(column).reshape(-1)
-        depth = other.depth.reshape(-1)[pixel].view_as(z)
-        theirs = other.std.reshape(-1)[pixel].view_as(z)
+        place, inside = hit(x, y, z, image_size=other.image_size)
+        depth, theirs = other.depth.reshape(-1)[place], other.std.reshape(-1)[place]
         limit = deviations * (variance + theirs.square()).sqrt()
         seen, farther = inside & known & (depth > 0), depth - z
         agree += seen & (farther.abs() <= limit)
