@@ -62,7 +62,7 @@ def hit(x: Tensor, y: Tensor, z: Tensor, *, image_size: tuple[int, int]) -> Hit:
         image_size: (height, width).
 
     Example:
-        >>> x, y, z = torch.tensor([[4.0, -8.0, 4.0], [2.0, 2.0, 2.0], [2.0, 2.0, -2.0]])
+        >>> x, y, z = torch.tensor([[4.0, -8.0, 0.0], [2.0, 2.0, 0.0], [2.0, 2.0, -2.0]])
         >>> hit(x, y, z, image_size=(3, 4))
         Hit(place=tensor([6, 0, 0]), inside=tensor([ True, False, False]))
     """

@@ -10,12 +10,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from deltas_geom import PosedViews
+from deltas_geom import PosedViews, project
+from deltas_geom.cameras.pixels import pixel_grid
+from deltas_geom.testing.strategies import vectors
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.consensus import LEAST, TOLERANCE, consensus
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.hidden import SAME, hidden, votes
 from deltas_nets.agree.neighbours import neighbours, sample
+from deltas_nets.agree.other_image import hit, motion
 from deltas_nets.agree.seen_from import seen_from
 from deltas_nets.network.known_depth import KnownDepth
 
@@ -44,6 +47,24 @@ def wall(view: PosedViews, distance: float = 3.0) -> Tensor:
 
 def sure(depth: Tensor, deviation: float = 0.02) -> KnownDepth:
     return KnownDepth(depth, torch.full_like(depth, deviation))
+
+
+@given(vectors(20, within=4.0), st.floats(-0.5, 0.5))
+def test_points_fall_on_the_pixel_whose_centre_is_nearest(points: Tensor, turn: float) -> None:
+    """Beside projections, of points around the camera."""
+    here, there = camera(0), camera(0.2, 0.1, turn)
+    turns, shift = motion(here, there, like=points)
+    x, y, z = (
+        turns[0] @ (here.K[0] @ points.mT) + shift[0]
+    ).unbind()  # in front of ``here`` or not
+    found, seen = hit(x, y, z, image_size=SIZE), project(there, points)
+    assert_close(z, seen.depth[0])
+    centres = pixel_grid(SIZE, dtype=torch.float64).reshape(-1, 2)
+    off, nearest = (seen.pixels[0][:, None] - centres).abs().amax(dim=-1).min(dim=-1)
+    sure = (off - 0.5).abs() > 1e-9  # on an edge between pixels, rounding decides
+    inside = seen.in_front[0] & (off < 0.5)
+    assert torch.equal(found.inside[sure], inside[sure])
+    assert torch.equal(found.place[sure], torch.where(inside, nearest, 0)[sure])
 
 
 @given(st.floats(-0.4, 0.4), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1))
