@@ -3,6 +3,7 @@
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.working_depth import working_depths
 
 __all__ = ["keyframes"]
@@ -19,7 +20,7 @@ def keyframes(capture: Capture, *, working_depth: float | None = None) -> list[s
         working_depth: how far surfaces are; as the capture knows if not given.
     """
     poses = capture.frames.cam_from_world
-    centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    centres = camera_centres(poses)
     depths = working_depths(capture) if working_depth is None else [working_depth] * len(poses)
     chosen: list[int] = []
     for number, (pose, centre) in enumerate(zip(poses, centres, strict=True)):

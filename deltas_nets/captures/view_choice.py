@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture, FloatArray
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.known_depths import points_in_view
+from deltas_nets.captures.seen_places import seen_places
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.working_depth import working_depths
 from deltas_nets.errors import UserError
@@ -99,14 +101,15 @@ def choose_views(
     wanted = ids if anchors is None else [capture.frame(id).id for id in anchors]
     depths = working_depths(capture) if working_depth is None else None
     poses = capture.frames.cam_from_world
-    centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    centres = camera_centres(poses)
 
     view_sets, short = [], Counter[str]()
     for id in wanted:
         anchor = index_of[id]
         depth = float(depths[anchor]) if depths is not None else working_depth or 0.0
         near = _candidates(centres, poses[:, 2, :3], anchor, depth)
-        seen = _seen_probes(capture, anchor, near, depth)
+        probes, nearest = _probes(capture, anchor, depth), NEAREST * depth
+        seen = seen_places(capture.frames, near, probes, poses[anchor], nearest=nearest)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
         angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
         log_score, hindered = _rate(offsets, angles, seen.mean(axis=-1), depth)
@@ -169,29 +172,6 @@ def _probes(capture: Capture, anchor: int, working_depth: float) -> FloatArray:
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
     rays = np.linalg.inv(capture.frames.K[anchor]) @ pixels
     return np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
-
-
-def _seen_probes(
-    capture: Capture, anchor: int, near: NDArray[np.intp], working_depth: float
-) -> NDArray[np.bool_]:
-    """Which of the anchor's probes each candidate sees, ``(C, P)``."""
-    frames, points = capture.frames, _probes(capture, anchor, working_depth)
-    poses = frames.cam_from_world
-    rotation, shift = poses[anchor, :3, :3], poses[anchor, :3, 3:]
-    # Relative poses first: with the world's origin kilometres away the sums would cancel.
-    turns = poses[near, :3, :3] @ rotation.T
-    seen = turns @ points + (poses[near, :3, 3:] - turns @ shift)
-    projected = frames.K[near] @ seen
-    depth = projected[:, 2]
-    in_front = depth > NEAREST * working_depth
-    safe = np.where(in_front, depth, 1.0)
-    column, row = projected[:, 0] / safe, projected[:, 1] / safe
-    sizes = frames.image_sizes[near].astype(np.float64)
-    inside = (np.abs(column - (sizes[:, 1:] - 1) / 2) <= sizes[:, 1:] / 2) & (
-        np.abs(row - (sizes[:, :1] - 1) / 2) <= sizes[:, :1] / 2
-    )
-    visible: NDArray[np.bool_] = in_front & inside
-    return visible
 
 
 def _rate(

@@ -3,6 +3,7 @@
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, FloatArray
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.known_depths import typical_depths
 
 __all__ = ["guessed_depth", "knows_its_scale", "working_depths"]
@@ -42,9 +43,8 @@ def working_depths(capture: Capture) -> FloatArray:
 def guessed_depth(capture: Capture) -> float:
     """Distance to what cameras look at together, or a multiple of their spacing."""
     poses = capture.frames.cam_from_world
-    rotations = poses[:, :3, :3]
-    centres = -(rotations.transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
-    axes, met, spacings = rotations[:, 2], [], []
+    centres = camera_centres(poses)
+    axes, met, spacings = poses[:, 2, :3], [], []
     for position, (centre, axis) in enumerate(zip(centres, axes, strict=True)):
         ways = np.delete(centres, position, axis=0) - centre
         lengths = np.linalg.norm(ways, axis=-1)

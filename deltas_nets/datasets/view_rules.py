@@ -5,6 +5,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.view_choice import spread_sources
@@ -100,7 +101,7 @@ class ByBaseline(NamedTuple):
         """Positions of the sources, best first."""
         qualify, cosines = self._qualify(frames, slice(anchor, anchor + 1))
         near = np.flatnonzero(qualify[0])
-        centres = _centres(frames.cam_from_world)
+        centres = camera_centres(frames.cam_from_world)
         offsets = (centres[near] - centres[anchor]) @ frames.cam_from_world[anchor, :3, :3].T
         angles = np.arccos(np.clip(cosines[0, near], -1, 1))
         log_score = -0.5 * (angles / (0.5 * self.max_rotation)) ** 2
@@ -114,17 +115,10 @@ class ByBaseline(NamedTuple):
 
     def _qualify(self, frames: Frames, anchors: slice) -> tuple[NDArray[np.bool_], FloatArray]:
         """``(A, F)`` whether frames may be sources of the anchors, and cosines of their angles."""
-        centres = _centres(frames.cam_from_world)
+        centres = camera_centres(frames.cam_from_world)
         rotations = frames.cam_from_world[:, :3, :3].reshape(-1, 9)
         distances = np.linalg.norm(centres[anchors, None] - centres, axis=-1)
         # The trace of R_a R_b^T is the sum of the products of their entries.
         cosines: FloatArray = (rotations[anchors] @ rotations.T - 1) / 2
         alike = cosines >= np.cos(self.max_rotation)
         return (distances >= self.low) & (distances <= self.high) & alike, cosines
-
-
-def _centres(cam_from_world: FloatArray) -> FloatArray:
-    centres: FloatArray = -(
-        cam_from_world[:, :3, :3].transpose(0, 2, 1) @ cam_from_world[:, :3, 3:]
-    )[..., 0]
-    return centres

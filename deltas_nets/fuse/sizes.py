@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.blocks import SIDE
 from deltas_nets.fuse.depth_view import DepthView
@@ -56,9 +57,7 @@ class Sizes(NamedTuple):
 
 def middle_of(capture: Capture) -> Tensor:
     """``(3,)`` float64, the mean of the cameras' centres."""
-    poses = capture.frames.cam_from_world
-    centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
-    return torch.from_numpy(centres.mean(axis=0))
+    return torch.from_numpy(camera_centres(capture.frames.cam_from_world).mean(axis=0))
 
 
 def look_at(source: DepthSource, voxel: float | None) -> Sizes:

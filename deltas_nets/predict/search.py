@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.known_depths import depths_of_sensor, points_in_view
 from deltas_nets.captures.measured import Measured, MeasuredDepth
@@ -190,12 +191,7 @@ class _Known:
 
 def _by_baseline(frames: Sequence[Frame]) -> Reach:
     """A wide search, of a world in which the cameras stand as usual."""
-    centres = np.array([_centre(frame) for frame in frames])
+    centres = camera_centres(np.stack([frame.cam_from_world for frame in frames]))
     apart = float(np.median(np.linalg.norm(centres[1:] - centres[0], axis=-1)))
     unit = FIRST_BASELINE / apart if apart > 0 else 1.0
     return Reach(FIRST_RANGE[0] / unit, FIRST_RANGE[1] / unit, unit)
-
-
-def _centre(frame: Frame) -> FloatArray:
-    centre: FloatArray = -frame.cam_from_world[:3, :3].T @ frame.cam_from_world[:3, 3]
-    return centre
