@@ -16,6 +16,7 @@ from deltas_nets.captures.images import (
     header_of,
     header_of_whole_file,
     in_words,
+    is_8_bit,
     resize_image,
 )
 from deltas_nets.errors import UserError
@@ -140,8 +141,7 @@ class Frame:
         return pixels
 
     def _check_image(self, header: Header) -> None:
-        if header.mode.startswith(("I", "F")):
-            # Pillow would clip these to white without a word.
+        if not is_8_bit(header):
             what = f"image has pixels of type {header.mode}, not 8-bit colour"
             raise UserError(what, self.image_path, "convert it to an 8-bit JPEG or PNG")
         if header.size != self.image_size:

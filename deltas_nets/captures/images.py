@@ -15,6 +15,7 @@ from PIL import Image
 from deltas_nets.errors import UserError
 
 __all__ = [
+    "RAW_SUFFIXES",
     "Header",
     "ImageMemory",
     "Span",
@@ -23,13 +24,19 @@ __all__ = [
     "header_of_whole_file",
     "image_size_of",
     "in_words",
+    "is_8_bit",
     "open_span",
     "resize_image",
+    "why_not_decoded",
 ]
 
 _END_OF_JPEG = b"\xff\xd9"
 _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises where a file is no image, or a damaged one."""
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+"""Of what a camera's sensor saw, undeveloped."""
+_NOT_PILLOWS = (".heic", ".heif", ".avif", ".jp2", *RAW_SUFFIXES)
+"""Kinds of images that it does not read, or not everywhere."""
 
 
 class Span(NamedTuple):
@@ -106,9 +113,32 @@ def decode(path: Path, span: Span | None = None, *, remedy: str) -> Image.Image:
     except FileNotFoundError as error:
         raise UserError("the image does not exist", path, remedy) from error
     except _UNREADABLE as error:
-        # Pillow's own texts repeat the path and a stream's address; only some help.
-        detail = " (the file is truncated)" if "truncated" in str(error) else ""
-        raise UserError(f"the image cannot be decoded{detail}", path, remedy) from error
+        what = f"the image cannot be decoded ({why_not_decoded(path, error)})"
+        raise UserError(what, path, remedy) from error
+
+
+def why_not_decoded(path: Path, error: Exception) -> str:
+    """What Pillow's error means; its own texts repeat the path and a stream's address.
+
+    Example:
+        >>> why_not_decoded(Path("IMG_1.HEIC"), OSError())
+        'Pillow alone reads no .heic: convert it to JPEG or PNG'
+    """
+    if path.is_file() and not path.stat().st_size:
+        return "the file is empty"
+    if "truncated" in str(error) or "unrecognized data stream" in str(error):
+        return "the file is truncated"
+    if isinstance(error, Image.DecompressionBombError):
+        return f"it has more than {2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels"
+    suffix = path.suffix.lower()
+    if suffix in _NOT_PILLOWS:
+        return f"Pillow alone reads no {suffix}: convert it to JPEG or PNG"
+    return "it is damaged, or of a kind that Pillow does not read"
+
+
+def is_8_bit(header: "Header") -> bool:
+    """Whether pixels are what cameras write; Pillow would clip others to white without a word."""
+    return not header.mode.startswith(("I", "F"))
 
 
 def header_of(image: Image.Image) -> Header:

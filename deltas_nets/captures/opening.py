@@ -11,11 +11,14 @@ from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.inside import several_captures
 from deltas_nets.captures.readers import (
+    arkitscenes,
     colmap,
     demon,
     kapture,
+    llff,
     mvsnet,
     openmvg,
     opensfm,
@@ -80,6 +83,8 @@ READERS: tuple[Reader, ...] = (
     sens,
     demon,
     strecha,
+    arkitscenes,
+    llff,
 )
 """The first that recognises a folder reads it."""
 
@@ -175,4 +180,23 @@ def _usable(capture: Capture) -> Capture:
         what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(capture.lost)})"
         where = [Path(lost.error.where).parent for lost in capture.lost.values()]
         raise UserError(what, next(iter(where), capture.path), "run the tracking again")
+    _check_images(capture)
     return capture
+
+
+def _check_images(capture: Capture) -> None:
+    """Refuse a capture whose images are all of a kind that is not read, or broken.
+
+    One that can be read is enough: what is wrong with a few is said where they are needed.
+    """
+    for frame in capture.frames.values():
+        path = frame.image_path
+        if frame.image_span or not path.is_file() or image_size_of(path) is not None:
+            return
+    first = capture.frames.at(0)
+    try:
+        first.read_image()
+    except UserError as error:
+        what = f"none of the {len(capture.frames)} images can be used: {error.what}"
+        remedy = "convert them to JPEG or PNG, or copy them again"
+        raise UserError(what, first.image_path, remedy) from error

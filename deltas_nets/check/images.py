@@ -9,7 +9,7 @@ from PIL import Image
 
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.images import open_span
+from deltas_nets.captures.images import header_of, is_8_bit, open_span, why_not_decoded
 from deltas_nets.check.copies import repeated
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.mending import leaving_out
@@ -54,8 +54,9 @@ def look_at_images(capture: Capture) -> list[Finding]:
     if broken:
         first = next(iter(broken))
         total = len(seen) + len(broken)
-        what = f"{len(broken)} of {total} images cannot be decoded ({first}: {broken[first]})"
-        cure = f"copy them again, or leave out {ids_in_words(broken, 20)}"
+        what = f"{len(broken)} of {total} images cannot be used ({first}: {broken[first]})"
+        cure = "copy them again, convert them to 8-bit JPEG, or leave out "
+        cure += ids_in_words(broken, 20)
         mend = leaving_out(tuple(broken))
         found = [Finding(Fault.IMAGES_UNREADABLE, what, tuple(broken), cure, "error", mend)]
     return [*found, *_blurred(capture, seen), *_same(capture, seen)]
@@ -64,6 +65,8 @@ def look_at_images(capture: Capture) -> list[Finding]:
 def _look(frame: Frame, position: int) -> _Seen | str:
     try:
         with Image.open(open_span(frame.image_path, frame.image_span)) as image:
+            if not is_8_bit(header_of(image)):
+                return f"pixels of type {image.mode}, not 8-bit colour"
             image.draft("L", (WIDTH, WIDTH * 2 // 3))
             grey = image.convert("L")
             width = min(WIDTH, grey.width)
@@ -71,7 +74,7 @@ def _look(frame: Frame, position: int) -> _Seen | str:
             small = grey.resize((width, height), Image.Resampling.BOX)
             thumb = small.resize(THUMB[::-1], Image.Resampling.BOX)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        return type(error).__name__
+        return why_not_decoded(frame.image_path, error)
     return _Seen(position, np.asarray(thumb, np.float32), _sharpness(np.asarray(small, np.float32)))
 
 

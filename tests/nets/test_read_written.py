@@ -10,12 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from written_captures import NUM, WRITERS, K, Scene, Written, make_scene, tum
+from written_captures import NUM, WRITERS, Scene, Written, make_scene, tum
+from written_data_sets import DATA_SETS
 
 from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.errors import UserError
+
+ALL = {**WRITERS, **DATA_SETS}
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +30,9 @@ def _relative(poses: np.ndarray) -> np.ndarray:
     return poses @ np.linalg.inv(poses[0])
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", ALL)
 def test_a_capture_is_read_as_it_was_written(layout: str, scene: Scene, tmp_path: Path) -> None:
-    written = WRITERS[layout](tmp_path / "capture", scene)
+    written = ALL[layout](tmp_path / "capture", scene)
     capture = open_capture(written.path)
     frames = [capture.frame(id) for id in written.ids]
     assert capture.layout.split(",")[0] == layout
@@ -38,7 +41,7 @@ def test_a_capture_is_read_as_it_was_written(layout: str, scene: Scene, tmp_path
     poses = np.stack([frame.cam_from_world for frame in frames])
     assert np.allclose(_relative(poses), _relative(scene.cam_from_world), rtol=0, atol=2e-6)
     for frame, depth in zip(frames, scene.depths, strict=True):
-        assert np.allclose(frame.K, K, rtol=1e-6, atol=0)
+        assert np.allclose(frame.K, written.K, rtol=1e-6, atol=0)
         assert (frame.lens and tuple(frame.lens)) == written.lens
         frame.check_image() if frame.lens is None else None
         assert (frame.depth_path is not None) == written.depth
@@ -124,9 +127,9 @@ def _broken(data: bytes, rng: np.random.Generator) -> list[bytes]:
     return [*cuts, *flipped, *odd, b"\xff\xfe\x00", b"[" * 100_000, b"{}"]
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", ALL)
 def test_broken_files_end_in_one_clear_line(layout: str, scene: Scene, tmp_path: Path) -> None:
-    written = WRITERS[layout](tmp_path / "capture", scene)
+    written = ALL[layout](tmp_path / "capture", scene)
     rng = np.random.default_rng(sum(layout.encode()))
     files = sorted(file for file in (tmp_path / "capture").rglob("*") if file.is_file())
     # One file of each kind, where every frame has one.
@@ -151,9 +154,9 @@ def test_broken_files_end_in_one_clear_line(layout: str, scene: Scene, tmp_path:
     assert _used(written.path) is not None
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", ALL)
 def test_links_in_a_circle_are_no_obstacle(layout: str, scene: Scene, tmp_path: Path) -> None:
-    written = WRITERS[layout](tmp_path / "capture", scene)
+    written = ALL[layout](tmp_path / "capture", scene)
     for folder in [tmp_path / "capture", *(tmp_path / "capture").iterdir()]:
         if folder.is_dir():
             (folder / "again").symlink_to(tmp_path / "capture", target_is_directory=True)
@@ -230,7 +233,7 @@ GIANTS = {
 @pytest.mark.parametrize("fault", GIANTS)
 def test_what_claims_to_be_giant_takes_no_memory(fault: str, scene: Scene, tmp_path: Path) -> None:
     layout, change = GIANTS[fault]
-    written = WRITERS[layout](tmp_path / "capture", scene)
+    written = ALL[layout](tmp_path / "capture", scene)
     change(written)
     tracemalloc.start()
     _used(written.path)

@@ -37,6 +37,7 @@ class Written(NamedTuple):
     depth: bool = False
     metric: bool = True
     doubts: int = 0
+    K: np.ndarray = K
 
 
 def make_scene() -> Scene:
@@ -51,13 +52,13 @@ def make_scene() -> Scene:
     return Scene(poses, images, depths)
 
 
-def _image(path: Path, pixels: np.ndarray) -> None:
+def write_image(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), pixels)
 
 
-def _steps(path: Path, depth: np.ndarray, scale: float = 1000) -> None:
-    _image(path, np.round(depth * scale).astype(np.uint16))
+def write_steps(path: Path, depth: np.ndarray, scale: float = 1000) -> None:
+    write_image(path, np.round(depth * scale).astype(np.uint16))
 
 
 def exr(depth: np.ndarray, compression: int = 3, top: int = 0) -> bytes:
@@ -88,7 +89,7 @@ def exr(depth: np.ndarray, compression: int = 3, top: int = 0) -> bytes:
     return head + places.astype("<u8").tobytes() + b"".join(chunks)
 
 
-def _text(path: Path, *rows: Any) -> None:
+def write_text(path: Path, *rows: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [row if isinstance(row, str) else " ".join(f"{x:.12g}" for x in row) for row in rows]
     path.write_text("\n".join(lines) + "\n")
@@ -117,14 +118,14 @@ def tum(folder: Path, scene: Scene) -> Written:
             t = 100 + i / 5 + 0.05 * part
             numbers = " ".join(f"{x:.12g}" for x in (*(pose[:3, 3] + part * step), *q))
             poses.append(f"{t:.6f} {numbers}")
-        _image(folder / "rgb" / f"{names[i]}.png", scene.images[i])
+        write_image(folder / "rgb" / f"{names[i]}.png", scene.images[i])
         late = f"{100 + i / 5 + 0.005:.6f}"
-        _steps(folder / "depth" / f"{late}.png", scene.depths[i], 5000)
+        write_steps(folder / "depth" / f"{late}.png", scene.depths[i], 5000)
     late = [f"{float(name) + 0.005:.6f}" for name in names]
-    _text(folder / "rgb.txt", "# list", *(f"{n} rgb/{n}.png" for n in [*names, "500.0"]))
-    _text(folder / "depth.txt", *(f"{n} depth/{n}.png" for n in late))
-    _text(folder / "groundtruth.txt", *poses)
-    _text(folder / "intrinsics.txt", (F, F, CX, CY, 0.1, -0.2, 0.01, 0.02, 0.3))
+    write_text(folder / "rgb.txt", "# list", *(f"{n} rgb/{n}.png" for n in [*names, "500.0"]))
+    write_text(folder / "depth.txt", *(f"{n} depth/{n}.png" for n in late))
+    write_text(folder / "groundtruth.txt", *poses)
+    write_text(folder / "intrinsics.txt", (F, F, CX, CY, 0.1, -0.2, 0.01, 0.02, 0.3))
     lens = "FULL_OPENCV", (0.1, -0.2, 0.01, 0.02, 0.3, 0.0, 0.0, 0.0)
     return Written(folder, names, lens, True, doubts=1)
 
@@ -135,7 +136,7 @@ def record3d(folder: Path, scene: Scene) -> Written:
     content = {"w": 64, "h": 48, "K": by_column, "poses": poses, "dw": 32, "dh": 24, "fps": 60}
     _json(folder / "EXR_RGBD" / "metadata.json", content)
     for i in range(NUM):
-        _image(folder / "EXR_RGBD" / "rgb" / f"{i}.jpg", scene.images[i])
+        write_image(folder / "EXR_RGBD" / "rgb" / f"{i}.jpg", scene.images[i])
         (folder / "EXR_RGBD" / "depth").mkdir(exist_ok=True)
         (folder / "EXR_RGBD" / "depth" / f"{i}.exr").write_bytes(exr(scene.depths[i]))
     return Written(folder, [str(i) for i in range(NUM)], None, True)
@@ -148,26 +149,26 @@ def polycam(folder: Path, scene: Scene) -> Written:
         keyframes = folder / "keyframes"
         # Stated for twice the size.
         _json(keyframes / f"corrected_cameras/{7 + i}.json", camera | {"width": 128, "height": 96})
-        _image(keyframes / "corrected_images" / f"{7 + i}.jpg", scene.images[i])
-        _steps(keyframes / "depth" / f"{7 + i}.png", scene.depths[i])
+        write_image(keyframes / "corrected_images" / f"{7 + i}.jpg", scene.images[i])
+        write_steps(keyframes / "depth" / f"{7 + i}.png", scene.depths[i])
     return Written(folder, [str(7 + i) for i in range(NUM)], None, True, doubts=1)
 
 
 def sevenscenes(folder: Path, scene: Scene) -> Written:
     """As 3DMatch does it: one camera, stated, in two sequences."""
-    _text(folder / "camera-intrinsics.txt", *K)
+    write_text(folder / "camera-intrinsics.txt", *K)
     names = [f"seq-0{1 + i % 2}/frame-{i:06d}" for i in range(NUM)]
     for name, pose, image, depth in zip(names, *scene, strict=True):
-        _image(folder / f"{name}.color.png", image)
-        _steps(folder / f"{name}.depth.png", depth)
-        _text(folder / f"{name}.pose.txt", *pose)
+        write_image(folder / f"{name}.color.png", image)
+        write_steps(folder / f"{name}.depth.png", depth)
+        write_text(folder / f"{name}.pose.txt", *pose)
     return Written(folder, names, None, True)
 
 
 def robustmvd(folder: Path, scene: Scene) -> Written:
     places = [folder / "key", *(folder / "source" / str(i) for i in range(NUM - 1))]
     for place, pose, image in zip(places, scene.cam_from_world, scene.images, strict=True):
-        _image(place / "image.png", image)
+        write_image(place / "image.png", image)
         np.save(place / "K.npy", K.astype(np.float32))
         np.save(place / "to_ref_transform.npy", pose @ scene.world_from_cam[0])
     return Written(folder, ["key", *(str(i) for i in range(NUM - 1))])
@@ -181,11 +182,13 @@ def opensfm(folder: Path, scene: Scene) -> Written:
     for i, pose in enumerate(scene.cam_from_world):
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()
         shots[f"{i}.jpg"] = {"rotation": turn, "translation": pose[:3, 3].tolist(), "camera": "a"}
-        _image(folder / "images" / f"{i}.jpg", scene.images[i])
+        write_image(folder / "images" / f"{i}.jpg", scene.images[i])
     points = {"5": {"coordinates": [1, 2, 3], "color": [9, 8, 7]}}
     content = {"cameras": {"a": camera}, "shots": shots, "points": points}
     _json(folder / "reconstruction.json", [{**content, "shots": {}}, content])
-    _text(folder / "tracks.csv", "OPENSFM_TRACKS_VERSION_v2", "0.jpg\t5\t0\t0.25\t-0.125\t1\t1\t1")
+    write_text(
+        folder / "tracks.csv", "OPENSFM_TRACKS_VERSION_v2", "0.jpg\t5\t0\t0.25\t-0.125\t1\t1\t1"
+    )
     lens = "FULL_OPENCV", (0.1, 0.2, 0.01, 0.02, 0.3, 0.0, 0.0, 0.0)
     return Written(folder, [str(i) for i in range(NUM)], lens, metric=False, doubts=1)
 
@@ -203,7 +206,7 @@ def openmvg(folder: Path, scene: Scene) -> Written:
         value = data(local_path="", filename=f"a {i}.jpg", **size)
         views.append(pair(i, polymorphic_id=2**30, ptr_wrapper=value))
         poses.append(pair(i, rotation=pose[:3, :3].T.tolist(), center=pose[:3, 3].tolist()))
-        _image(folder / "photos" / f"a {i}.jpg", scene.images[i])
+        write_image(folder / "photos" / f"a {i}.jpg", scene.images[i])
     lens = {"disto_t2": [0.1, 0.2, 0.3, 0.01, 0.02]}
     camera = data(width=64, height=48, focal_length=F, principal_point=[CX, CY], **lens)
     kind = {"polymorphic_id": 2**31 + 1, "polymorphic_name": "pinhole_brown_t2"}
@@ -236,19 +239,19 @@ def kapture(folder: Path, scene: Scene) -> Written:
     camera = f"camera, OPENCV, 64, 48, {F}, {F}, {CX + 0.5}, {CY + 0.5}, .1, .2, .01, .02"
     head = "# kapture format: 1.1"
     sensors = folder / "sensors"
-    _text(sensors / "sensors.txt", head, f"left, , {camera}", f"right, x, {camera}")
+    write_text(sensors / "sensors.txt", head, f"left, , {camera}", f"right, x, {camera}")
     rigs = [row("rig", "left", pose=np.eye(4)), row("rig", "right", pose=turn)]
-    _text(sensors / "rigs.txt", head, *rigs)
+    write_text(sensors / "rigs.txt", head, *rigs)
     records, poses = [], []
     for i, pose in enumerate(scene.cam_from_world):
         device = ("left", "right")[i % 2]
         rig = pose if i % 2 == 0 else np.linalg.inv(turn) @ pose
         records.append(f"{i}, {device}, {device}/{i}.jpg")
         poses.append(row(i, "rig", pose=rig) if i < 2 else row(i, device, pose=pose))
-        _image(sensors / "records_data" / device / f"{i}.jpg", scene.images[i])
-    _text(sensors / "records_camera.txt", head, *records)
-    _text(sensors / "trajectories.txt", head, *poses)
-    _text(folder / "reconstruction" / "points3d.txt", head, "1, 2, 3, 9, 8, 7")
+        write_image(sensors / "records_data" / device / f"{i}.jpg", scene.images[i])
+    write_text(sensors / "records_camera.txt", head, *records)
+    write_text(sensors / "trajectories.txt", head, *poses)
+    write_text(folder / "reconstruction" / "points3d.txt", head, "1, 2, 3, 9, 8, 7")
     ids = [f"{('left', 'right')[i % 2]}/{i}" for i in range(NUM)]
     return Written(folder, ids, ("OPENCV", (0.1, 0.2, 0.01, 0.02)), metric=False)
 
@@ -257,13 +260,13 @@ def mvsnet(folder: Path, scene: Scene) -> Written:
     moved = np.array([[F, 0, CX + 0.5], [0, F, CY + 0.5], [0, 0, 1]])
     for i, pose in enumerate(scene.cam_from_world):
         rows = "extrinsic", *pose, "", "intrinsic", *moved, "", "0.5 0.1 51 5.5"
-        _text(folder / "cams" / f"{i:08d}_cam.txt", *rows)
-        _image(folder / "images" / f"{i:08d}.jpg", scene.images[i])
-        _image(folder / "depths" / f"{i:08d}.pfm", scene.depths[i].astype(np.float32))
+        write_text(folder / "cams" / f"{i:08d}_cam.txt", *rows)
+        write_image(folder / "images" / f"{i:08d}.jpg", scene.images[i])
+        write_image(folder / "depths" / f"{i:08d}.pfm", scene.depths[i].astype(np.float32))
     pairs = [
         line for i in range(NUM) for line in (str(i), f"2 {(i + 2) % NUM} 9.5 {(i + 1) % NUM} 3")
     ]
-    _text(folder / "pair.txt", str(NUM), *pairs)
+    write_text(folder / "pair.txt", str(NUM), *pairs)
     return Written(folder, [f"{i:08d}" for i in range(NUM)], None, True, metric=False)
 
 
@@ -285,19 +288,19 @@ def sens(folder: Path, scene: Scene) -> Written:
 
 
 def demon(folder: Path, scene: Scene) -> Written:
-    _text(folder / "cam.txt", *K)
-    _text(folder / "poses.txt", *(pose[:3].ravel() for pose in scene.cam_from_world))
+    write_text(folder / "cam.txt", *K)
+    write_text(folder / "poses.txt", *(pose[:3].ravel() for pose in scene.cam_from_world))
     for i in range(NUM):
-        _image(folder / f"{i:04d}.jpg", scene.images[i])
+        write_image(folder / f"{i:04d}.jpg", scene.images[i])
         np.save(folder / f"{i:04d}.npy", scene.depths[i].astype(np.float32))
     return Written(folder, [f"{i:04d}" for i in range(NUM)], None, True)
 
 
 def strecha(folder: Path, scene: Scene) -> Written:
     for i, pose in enumerate(scene.world_from_cam):
-        _image(folder / "images" / f"{i:04d}.jpg", scene.images[i])
+        write_image(folder / "images" / f"{i:04d}.jpg", scene.images[i])
         rows = *K, "0 0 0", *pose[:3, :3], pose[:3, 3], "64 48"
-        _text(folder / "cameras" / f"{i:04d}.jpg.camera", *rows)
+        write_text(folder / "cameras" / f"{i:04d}.jpg.camera", *rows)
     return Written(folder, [f"{i:04d}" for i in range(NUM)], metric=False)
 
 

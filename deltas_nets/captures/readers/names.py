@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from deltas_nets.captures.images import RAW_SUFFIXES
 from deltas_nets.errors import UserError
 
 __all__ = [
@@ -18,7 +19,8 @@ __all__ = [
 
 IMAGE_SUFFIXES = (
     ".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".heic",
-    ".heif",
+    ".heif", ".jfif", ".avif", ".jp2", ".gif",
+    *RAW_SUFFIXES,
 )  # fmt: skip
 """Of colour images, in the order in which a missing one is tried."""
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pfm", ".pgm")

@@ -9,6 +9,7 @@ from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.json_file import Fields, read_json
+from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of
 from deltas_nets.errors import UserError
 
@@ -36,7 +37,7 @@ def read(path: Path) -> Capture:
     if cameras.name == "cameras":
         doubts.append(f"poses are as tracked, not optimised (no corrected_cameras), {folder}")
     found = Collected(images)
-    files = sorted(file for file in cameras.iterdir() if file.suffix.lower() == ".json")
+    files = sorted(listed(cameras, ".json"))
     for file in files:
         id = file.stem
         image = next(
@@ -76,7 +77,7 @@ def _keyframes(path: Path) -> tuple[Path, Path] | None:
 
 
 def _holds_json(folder: Path) -> bool:
-    return any(file.suffix.lower() == ".json" for file in folder.iterdir())
+    return next(listed(folder, ".json"), None) is not None
 
 
 def _K(fields: Fields) -> FloatArray:

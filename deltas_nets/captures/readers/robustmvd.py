@@ -11,6 +11,7 @@ from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import natural_key
 from deltas_nets.captures.readers.cameras import camera_matrix
 from deltas_nets.captures.readers.collected import Collected
+from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.poses import cam_from_world
 from deltas_nets.errors import UserError
 
@@ -32,7 +33,7 @@ def read(path: Path) -> Capture:
     the world, whatever the name says.
     """
     folders = {"key": path / "key"}
-    sources = [folder for folder in (path / "source").iterdir() if folder.is_dir()]
+    sources = [folder for folder in listed(path / "source") if folder.is_dir()]
     folders |= {
         folder.name: folder for folder in sorted(sources, key=lambda each: natural_key(each.name))
     }

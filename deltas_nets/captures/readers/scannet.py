@@ -20,6 +20,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
 """Folders that scenes may lie in, inside of the one that is named."""
 
+_OTHERWISE = "or write frames.json, as docs/captures.md shows"
 _NO_POSE = "repair it or take the frame out of the view sets"
 
 
@@ -116,8 +117,10 @@ def _find_files(scene: Path) -> _SceneFiles:
             intrinsics are missing or do not fit the images.
     """
     remedies = {
-        "color": "put the images there: color/0.jpg, color/1.jpg, ...",
-        "pose": "put a 4x4 camera-to-world matrix there for each image: pose/0.txt, ...",
+        "color": "put the images there: color/0.jpg, color/1.jpg, ...; " + _OTHERWISE,
+        "pose": (
+            "put a 4x4 camera-to-world matrix there for each image: pose/0.txt, ...; " + _OTHERWISE
+        ),
     }
     for name, remedy in remedies.items():
         if not (scene / name).is_dir():

@@ -14,6 +14,7 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import Span
 from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images
 from deltas_nets.errors import UserError
 
@@ -109,7 +110,7 @@ def _frame(
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix.lower() == ".sens" else []
-    return sorted(file for file in path.glob("*.sens") if file.is_file())
+    return sorted(file for file in listed(path, ".sens") if file.is_file())
 
 
 def _header(file: BinaryIO, path: Path) -> _Header:

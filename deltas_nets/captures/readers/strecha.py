@@ -9,6 +9,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.readers.cameras import camera_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
+from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.names import frame_ids
 from deltas_nets.captures.readers.poses import cam_from_world_of, rigid
 from deltas_nets.captures.text_lines import read_numbers
@@ -57,8 +58,8 @@ def _cameras(path: Path) -> Sequence[Path]:
     """Of the folder, or of the first in it that has some."""
     if not path.is_dir():
         return ()
-    found = sorted(path.glob("*.camera"))
-    if not found:
-        inside = sorted(path.glob("*/*.camera"))
-        found = [file for file in inside if file.parent == inside[0].parent]
-    return found
+    found = sorted(listed(path, ".camera"))
+    folders = () if found else sorted(each for each in listed(path) if each.is_dir())
+    return found or next(
+        (inside for each in folders if (inside := sorted(listed(each, ".camera")))), ()
+    )

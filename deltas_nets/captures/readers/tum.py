@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deltas_nets.captures.camera_words import Intrinsics, named_camera
 from deltas_nets.captures.capture import Capture, Lost
@@ -17,8 +16,8 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of, in_words
 from deltas_nets.captures.readers.names import frame_ids, without_common_folder
-from deltas_nets.captures.readers.poses import cam_from_world_of, rigid
-from deltas_nets.captures.rotations import rotations_of
+from deltas_nets.captures.readers.poses import cam_from_world_of
+from deltas_nets.captures.readers.trajectory import GAP, Trajectory, nearest_stamps
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
@@ -28,10 +27,6 @@ STEPS = 5000.0
 """Steps of depth in a metre."""
 APART = 0.02
 """Seconds between an image and its depth at most, as in the data set's own associate.py."""
-GAP = 0.1
-"""Seconds between two poses over which a camera moves evenly enough to interpolate."""
-SAME = 0.002
-"""Seconds from a pose that need no interpolation: 2 mm at 1 m/s."""
 KNOWN_SIZE = 480, 640
 
 _LIST_REMEDY = "write a time stamp and a file's name on each line"
@@ -50,14 +45,6 @@ class _Listed(NamedTuple):
     stamps: FloatArray
     names: Sequence[str]
     missing: int
-
-
-class _Trajectory(NamedTuple):
-    """Poses in the order of their stamps: ``(P,)``, ``(P, 3)``, ``(P, 4)`` with w first."""
-
-    stamps: FloatArray
-    centres: FloatArray
-    quaternions: FloatArray
 
 
 def recognises(path: Path) -> bool:
@@ -84,8 +71,8 @@ def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
     if image_size is None:
         raise UserError("no image can be decoded", path / images.names[0], "copy the files again")
     camera, said = _camera(path, image_size) if intrinsics is None else (intrinsics, "")
-    poses = _poses_at(images.stamps, _read_trajectory(path / "groundtruth.txt"))
-    nearest = _nearest(images.stamps, depths.stamps)
+    poses = _read_trajectory(path / "groundtruth.txt").poses_at(images.stamps)
+    nearest = nearest_stamps(images.stamps, depths.stamps, apart=APART)
     frames, lost, late = [], {}, 0
     ids = frame_ids(without_common_folder(images.names), path / "rgb.txt")
     for place, (id, name) in enumerate(zip(ids, images.names, strict=True)):
@@ -179,7 +166,7 @@ def _is_there(folder: Path, name: str, known: dict[str, frozenset[str]]) -> bool
     return file in known[above] and (folder / name).is_file()
 
 
-def _read_trajectory(path: Path) -> _Trajectory:
+def _read_trajectory(path: Path) -> Trajectory:
     text = read_text(path, name="list of poses", remedy=_POSE_REMEDY)
     try:
         with warnings.catch_warnings(action="ignore"):
@@ -191,7 +178,7 @@ def _read_trajectory(path: Path) -> _Trajectory:
     if table.shape[1] != 8 or not np.isfinite(table[:, 0]).all():
         raise _wrong_line(text, path)
     table = table[np.argsort(table[:, 0], kind="stable")]
-    return _Trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])
+    return Trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])
 
 
 def _wrong_line(text: str, path: Path) -> UserError:
@@ -228,56 +215,9 @@ def _number(word: str, line: int, path: Path) -> float:
     return value
 
 
-def _poses_at(stamps: FloatArray, known: _Trajectory) -> FloatArray:
-    """``(F, 4, 4)`` world_from_cam between the poses before and after; NaN where none are near."""
-    last = len(known.stamps) - 1
-    after = np.searchsorted(known.stamps, stamps).clip(0, last)
-    before = (after - 1).clip(0, last)
-    gap = known.stamps[after] - known.stamps[before]
-    part = (stamps - known.stamps[before]) / np.where(gap > 0, gap, 1)
-    within = (gap <= GAP) & (part >= 0) & (part <= 1)
-    # Poses of key frames alone are far apart, but at the stamps of their images.
-    nearer = np.where(np.abs(stamps - known.stamps[after]) < np.abs(part * gap), after, before)
-    at_one = np.abs(stamps - known.stamps[nearer]) <= SAME
-    part = np.where(within, part, (nearer == after) & (after > before))
-    part = np.where(within | at_one, part, np.nan)[:, None]
-    centres = (1 - part) * known.centres[before] + part * known.centres[after]
-    turns = _slerp(known.quaternions[before], known.quaternions[after], part)
-    return np.stack(
-        [rigid(R, t) for R, t in zip(rotations_of(turns), centres, strict=True)]
-    ).reshape(-1, 4, 4)
-
-
-def _slerp(first: FloatArray, last: FloatArray, part: FloatArray) -> FloatArray:
-    with np.errstate(all="ignore"):
-        first = first / np.linalg.norm(first, axis=1, keepdims=True)
-        last = last / np.linalg.norm(last, axis=1, keepdims=True)
-        cosine = (first * last).sum(axis=1, keepdims=True)
-        last, cosine = np.where(cosine < 0, -last, last), np.abs(cosine).clip(0, 1)
-        angle = np.arccos(cosine)
-        # Where the sine has no digits left, the chord is the arc.
-        near = angle < 1e-6
-        sine = np.where(near, 1, np.sin(angle))
-        a = np.where(near, 1 - part, np.sin((1 - part) * angle) / sine)
-        b = np.where(near, part, np.sin(part * angle) / sine)
-    return a * first + b * last
-
-
 def _pose(world_from_cam: FloatArray, id: str, stamp: float, path: Path) -> FloatArray | Lost:
     if not np.isfinite(world_from_cam).all():
         what = f"there is no pose at the time {stamp:.6f} of frame {id}"
         remedy = f"add poses no more than {GAP} s apart, or take the frame out of the view sets"
         return Lost("no pose", UserError(what, path, remedy))
     return cam_from_world_of(world_from_cam, id=id, path=path)
-
-
-def _nearest(stamps: FloatArray, others: FloatArray) -> NDArray[np.int64]:
-    """The position of the nearest of other stamps, in order; -1 where none is within `APART`."""
-    if not len(others):
-        return np.full(len(stamps), -1)
-    after = np.searchsorted(others, stamps).clip(0, len(others) - 1)
-    before = (after - 1).clip(0)
-    nearer = np.where(
-        np.abs(others[after] - stamps) < np.abs(others[before] - stamps), after, before
-    )
-    return np.where(np.abs(others[nearer] - stamps) <= APART, nearer, -1)
