@@ -31,7 +31,7 @@ def verdict(records: Sequence[Mapping[str, Any]], *, short: int = 0) -> Verdict:
     """What maps are like as a whole.
 
     Args:
-        records: of frames, as `deltas_nets.predict.capture` writes them.
+        records: of frames, as `deltas_nets.predict.passes` writes them.
         short: view sets with fewer views than asked.
 
     Example:
