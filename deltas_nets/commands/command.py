@@ -16,6 +16,9 @@ class Command:
     checks: ClassVar[Mapping[str, Callable[[Any, str], object]]] = {}
     """Of values of its own flags, by name: see `deltas_nets.commands.values`."""
 
+    groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+    """Options by title, as the help shows them; all in one where there are none."""
+
     @classmethod
     def parsed_as(cls, arguments: Sequence[str]) -> Any:
         """The type that tyro parses; the defaults of flags may depend on other arguments."""

@@ -4,7 +4,7 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from textwrap import shorten
 from typing import Any, NoReturn, Union
 
@@ -12,6 +12,7 @@ import tyro
 
 from deltas_nets import __version__
 from deltas_nets.commands.command import Command
+from deltas_nets.commands.grouped_help import grouped_help
 from deltas_nets.commands.values import check_values
 from deltas_nets.commands.words import first_page, sentence
 from deltas_nets.errors import UserError
@@ -48,9 +49,11 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
 def parse(arguments: Sequence[str], commands: Commands) -> Command:
     """The command that the arguments name; one line of error where they make no sense."""
     said = io.StringIO()
+    names = {command.__name__.lower(): command for command in commands}
+    groups = names[arguments[0]].groups if arguments[0] in names else {}
     kinds: Any = Union[tuple(command.parsed_as(arguments) for command in commands)]  # noqa: UP007
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), _shown_by(groups):
             command: Command = tyro.cli(
                 kinds,
                 prog="deltas",
@@ -63,11 +66,25 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
         if not stopped.code:
             sys.stdout.flush()  # the help, which a reader may have had enough of
             raise
-        names = {command.__name__.lower(): command for command in commands}
         what = sentence(_in_words(said.getvalue()), names, arguments)
         what = shorten(what, 200, placeholder=" ...")
         _fail(UserError(what, "command line", _help_of(arguments, commands)))
     return command
+
+
+@contextlib.contextmanager
+def _shown_by(groups: Mapping[str, Sequence[str]]) -> Iterator[None]:
+    """Help that is printed meanwhile is shown by groups, where there are some."""
+    if not groups:
+        yield
+        return
+    shown = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(shown):
+            yield
+    finally:
+        if shown.getvalue():
+            print(grouped_help(shown.getvalue(), groups))
 
 
 def _in_words(box: str) -> str:

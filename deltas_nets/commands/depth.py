@@ -83,6 +83,20 @@ class Depth(Captured, Measuring, Prediction):
     overwrite: Flag = False
     """Start again instead of continuing, or write into a folder that holds other things."""
 
+    groups: ClassVar = {
+        "the capture": ("CAPTURE", "--intrinsics", "--scale", "--scale-from"),
+        "what is written": (
+            "--out", "--size", "--format", "--depth-scale", "--min-confidence", "--mesh",
+            "--cloud", "--page", "--overwrite",
+        ),
+        "how depth is searched": (
+            "--depth-range", "--views", "--view-sets", "--keyframes", "--passes",
+            "--sensor-depth", "--sensor-deviation",
+        ),
+        "the network, and how fast": (
+            "--weights", "--work-size", "--precision", "--device", "--workers", "--shard",
+        ),
+    }  # fmt: skip
     going_on = "the same command goes on"
     checks: ClassVar = {"workers": at_least_one}
 
