@@ -1,7 +1,6 @@
 """A cost-volume network makes a depth map of posed frames: no points, but a deviation."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,9 +12,7 @@ from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import load_views
 from deltas_nets.config import to_dict
 from deltas_nets.config.varied import NetworkSettings
-from deltas_nets.errors import UserError
 from deltas_nets.network.cost_volume.network import CostVolume
-from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import (
     DepthMap,
@@ -24,10 +21,11 @@ from deltas_nets.predict.depth_map import (
     keypoint_depths,
 )
 from deltas_nets.predict.ours import work_size_of
+from deltas_nets.predict.views_alone import ViewsAlone
 from deltas_nets.weights_file import weights_record
 
 
-class DensePredictor:
+class DensePredictor(ViewsAlone):
     """A cost-volume network; see :class:`deltas_nets.predict.predictor.Predictor`.
 
     Args:
@@ -38,6 +36,11 @@ class DensePredictor:
 
     def __init__(self, model: CostVolume) -> None:
         self.model = model
+
+    @property
+    def called(self) -> str:
+        """By the name of its config."""
+        return self.model.config.name
 
     def check_asked(
         self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
@@ -57,21 +60,13 @@ class DensePredictor:
         measured: MeasuredDepth | None = None,
     ) -> DepthMap:
         """Depth of the first frame from all of them; it takes no measured depth."""
-        if measured is not None or len(frames) == 1:
-            what = (
-                f"{self.model.config.name} takes no measured depth, and looks at two views or more"
-            )
-            raise UserError(what, "--sensor-depth", "leave it out")
+        self.refuse_measured(frames, measured)
         device = next(self.model.parameters()).device
         images, views = load_views(frames, work_size=work_size_of(frames[0], config))
         of_device = PosedViews(*(part.to(device) for part in views))
         found = self.model(images.to(device), of_device, config.depth_range)
         work = KnownDepth(found.depth, found.std / found.depth)
         return finished_map(frames[0], work, keypoint_depths(found), config)
-
-    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
-        """It is none."""
-        raise UserError(refusal, where, remedy)
 
     def network_record(self) -> dict[str, Any]:
         """Its config."""

@@ -7,7 +7,6 @@ published weights saw them; one camera matrix stands for all views. The network 
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import SMALLEST_BASELINE
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
-from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.detector import CELL
 from deltas_nets.predict.depth_map import (
     DepthMap,
@@ -33,6 +31,7 @@ from deltas_nets.predict.depth_map import (
     point_cloud,
     resized,
 )
+from deltas_nets.predict.views_alone import ViewsAlone
 from deltas_nets.reference import ReferenceNetwork, evaluation_input
 from deltas_nets.reference.segments import FAR, NEAR
 from deltas_nets.reference.settings import PUBLISHED
@@ -77,7 +76,7 @@ class ReferenceDepth(NamedTuple):
     point_depth: Tensor
 
 
-class ReferencePredictor:
+class ReferencePredictor(ViewsAlone):
     """The reference network; it looks at all images of a view set together and remembers none.
 
     See :class:`deltas_nets.predict.predictor.Predictor`.
@@ -88,6 +87,7 @@ class ReferencePredictor:
     """
 
     states_confidence = False
+    called = "the reference network"
 
     def __init__(self, network: ReferenceNetwork, settings: NetworkSettings = PUBLISHED) -> None:
         self.network = network
@@ -104,9 +104,7 @@ class ReferencePredictor:
         if config.depth_range != DEPTH_RANGE:
             what = "the reference network searches {:g} to {:g} m".format(*DEPTH_RANGE)
             raise UserError(what, "--depth-range", "leave it out")
-        if config.min_confidence > 0:
-            what = "the reference network states no confidence"
-            raise UserError(what, "--min-confidence", "leave it out")
+        self.refuse_confidence(config)
         work_size = config.work_size or WORK_SIZE
         check_work_size(work_size)
         for views in view_sets:
@@ -119,9 +117,7 @@ class ReferencePredictor:
         measured: MeasuredDepth | None = None,
     ) -> DepthMap:
         """Depth of the first frame from all of them; it takes no measured depth."""
-        if measured is not None or len(frames) == 1:
-            what = "the reference network takes no measured depth, and looks at two views or more"
-            raise UserError(what, "--sensor-depth", "leave it out")
+        self.refuse_measured(frames, measured)
         work_size = config.work_size or WORK_SIZE
         found = predict_reference(self.network, frames, work_size=work_size, settings=self.settings)
         size = config.size or frames[0].image_size
@@ -129,10 +125,6 @@ class ReferencePredictor:
         points, colors = point_cloud(frames[0], depth, size, work_size)
         keypoints = KeypointDepths(found.pixels, found.point_depth, work_size)
         return DepthMap(depth, None, points, colors, keypoints)
-
-    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
-        """It is none."""
-        raise UserError(refusal, where, remedy)
 
     def network_record(self) -> dict[str, Any]:
         """Its name in records, and what its program did not have."""

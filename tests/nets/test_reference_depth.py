@@ -123,8 +123,6 @@ def test_what_it_cannot_do_is_one_line_and_nothing_is_written(
     assert_one_line(run(*base, "--min-confidence", 0.5), "states no confidence")
     assert_one_line(run("demo", "--weights", checkpoint, "--out", out), "use deltas depth")
     assert_one_line(run(*base, "--precision", "bfloat16"), "float32 alone", "leave it out")
-    rooms = run("evaluate", "--rooms", 1, "--weights", checkpoint)
-    assert_one_line(rooms, "the reference network", "name a capture")
     exported = run("export", "--weights", checkpoint, "--out", tmp_path / "a.onnx")
     assert_one_line(exported, "the reference network", "name weights of deltas train")
     assert not out.exists()

@@ -1,0 +1,46 @@
+"""What networks and baselines have in common that take views and nothing else, and have no stages
+of a network of deltas."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.measured import MeasuredDepth
+from deltas_nets.errors import UserError
+from deltas_nets.network.deltas import Deltas
+from deltas_nets.predict.depth_map import PredictConfig
+
+__all__ = ["ViewsAlone"]
+
+
+class ViewsAlone:
+    """A part of :class:`deltas_nets.predict.predictor.Predictor`: what these refuse."""
+
+    @property
+    def called(self) -> str:
+        """As refusals call it."""
+        raise NotImplementedError
+
+    def refuse_measured(self, frames: Sequence[Frame], measured: MeasuredDepth | None) -> None:
+        """Refuse what only a network of deltas can use.
+
+        Raises:
+            UserError: there is measured depth, or no source.
+        """
+        if measured is not None or len(frames) == 1:
+            what = f"{self.called} takes no measured depth, and looks at two views or more"
+            raise UserError(what, "--sensor-depth", "leave it out")
+
+    def refuse_confidence(self, config: PredictConfig) -> None:
+        """Refuse what only a network that states a confidence can use.
+
+        Raises:
+            UserError: pixels of less confidence are to be left out.
+        """
+        if config.min_confidence > 0:
+            what = f"{self.called} states no confidence"
+            raise UserError(what, "--min-confidence", "leave it out")
+
+    def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
+        """It is none."""
+        raise UserError(refusal, where, remedy)
