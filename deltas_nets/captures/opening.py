@@ -1,6 +1,7 @@
 """From a folder to a capture, whatever its layout."""
 
 import gc
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -34,6 +35,7 @@ from deltas_nets.captures.readers import (
     tum,
 )
 from deltas_nets.captures.readers.colmap_folder import PLACES
+from deltas_nets.captures.readers.names import IMAGE_SUFFIXES
 from deltas_nets.captures.readers.refused import refusal
 from deltas_nets.errors import UserError
 
@@ -124,7 +126,7 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
                 raise several
         if reader is None:
             what = "there is no capture in the folder" if path.is_dir() else "this is no capture"
-            raise refusal(path) or UserError(what, path, _LAYOUTS)
+            raise _part_of(path) or refusal(path) or UserError(what, path, _LAYOUTS)
         with _uncollected():
             capture = _read(reader, path, intrinsics)
         return _usable(capture)
@@ -135,8 +137,25 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
 
 def _found_inside(reader: Reader, path: Path) -> bool:
     """Whether a reader may have recognised a folder by a folder in it alone."""
-    itself = scannet.is_scene(path) or any((path / place).is_dir() for place in PLACES)
-    return reader in _LOOKING_INSIDE and not itself
+    return reader in _LOOKING_INSIDE and not _holds_model(path)
+
+
+def _holds_model(path: Path) -> bool:
+    """Whether a folder, not one in it, is that of a scene of ScanNet's or a model of COLMAP's."""
+    return scannet.is_scene(path) or any((path / place).is_dir() for place in PLACES)
+
+
+def _part_of(path: Path) -> UserError | None:
+    """What to say of a capture's folder of photos, or of one: they are what people look for."""
+    if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
+        return None
+    around = Path(os.path.abspath(path)).parent
+    for folder in (around, around.parent):
+        quick = (reader for reader in READERS if reader not in _LOOKING_INSIDE)
+        if _holds_model(folder) or any(reader.recognises(folder) for reader in quick):
+            what = "this is a part of a capture, which is a folder around it"
+            return UserError(what, path, f"name {folder}")
+    return None
 
 
 def _read(reader: Reader, path: Path, intrinsics: Intrinsics | None) -> Capture:

@@ -57,6 +57,8 @@ LAYOUTS = {
     "EuRoC": ("mav0/cam0/data.csv",),
     "KITTI": ("calib.txt", "times.txt", "image_2/0.png"),
     "NICE-SLAM": ("traj.txt", "results/frame0.jpg"),
+    "Stray Scanner": ("odometry.csv", "camera_matrix.csv", "rgb.mp4"),
+    "deltas depth": ("summary.json", "depth/0.png"),
     "NeuS": ("cameras_sphere.npz", "image/0.png"),
     "SDFStudio": ("meta_data.json",),
     "Record3D": ("metadata", "rgbd/0.jpg"),
@@ -98,6 +100,18 @@ def test_photos_without_poses_are_told_what_finds_them(inside: str, tmp_path: Pa
         open_capture(tmp_path)
     assert "3 photos" in error.value.what and "colmap" in error.value.remedy
     assert error.value.where == tmp_path / inside and "frames.json" in error.value.remedy
+
+
+@pytest.mark.parametrize("to", ["own", "colmap", "transforms", "scannet"])
+def test_who_names_the_photos_of_a_capture_is_told_the_capture(to: str, tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    save_capture(open_capture(write_capture(tmp_path / "in")), capture, to)
+    photo = next(capture.rglob("*.jpg"))
+    for path in (photo.parent, photo):
+        with pytest.raises(UserError) as error:
+            open_capture(path)
+        assert "part of a capture" in error.value.what
+        assert error.value.remedy == f"name {capture}"
 
 
 KINDS = {

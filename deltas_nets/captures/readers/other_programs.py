@@ -137,6 +137,17 @@ LAYOUTS: tuple[Layout, ...] = (
         "make a folder of a scan: Cameras as cams, its images as images/00000000.png, ...",
     ),
     Layout(
+        "a recording of Stray Scanner",
+        ("odometry.csv", "camera_matrix.csv"),
+        f"make images of rgb.mp4 (ffmpeg -i rgb.mp4 images/%06d.jpg) and {OWN}: a row of "
+        "odometry.csv is camera-to-world, camera_matrix.csv the K",
+    ),
+    Layout(
+        "a folder that deltas depth filled",
+        ("summary.json", "depth"),
+        "name the capture that the maps were made of",
+    ),
+    Layout(
         "TUM RGB-D with its lists joined",
         ("assoc*.txt", "rgb"),
         "write the two lists again: rgb.txt and depth.txt with a stamp and a file a line",
