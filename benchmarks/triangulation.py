@@ -22,7 +22,7 @@ from deltas_geom.testing import rigid
 from deltas_geom.testing.targets import KORNIA_SOLVERS, kornia, opencv
 
 NUM_POINTS = 100_000
-REPEATS = 7
+REPEATS = 11
 # Inductor would cut the one loop into pieces, and carry everything between them through memory.
 # It would also give up vector instructions where pixels are not next to each other in memory.
 COMPILED = {
@@ -56,7 +56,7 @@ def scene(num_views: int) -> Scene:
 
 
 def milliseconds(*runs: Callable[[], object]) -> list[float]:
-    """Median processor time of each, taken in turns so that all see the same machine."""
+    """Least processor time of each, to which a busy machine only adds; taken in turns."""
     times: list[list[float]] = [[] for _ in runs]
     for repeat in range(REPEATS + 1):
         for run, seen in zip(runs, times, strict=True):
@@ -64,7 +64,7 @@ def milliseconds(*runs: Callable[[], object]) -> list[float]:
             run()
             if repeat:  # the first is a warm-up
                 seen.append(time.process_time() - began)
-    return [1000 * statistics.median(seen) for seen in times]
+    return [1000 * min(seen) for seen in times]
 
 
 def check(points: Tensor, found: Tensor, peer: Tensor) -> None:

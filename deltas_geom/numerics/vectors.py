@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.arithmetic import values_at_hand
+
 Vector3 = tuple[Tensor, ...]
 """x y z."""
 Vector4 = tuple[Tensor, ...]
@@ -55,3 +57,15 @@ def less(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 def either(where: Tensor, a: Sequence[Tensor], b: Sequence[Tensor | float]) -> tuple[Tensor, ...]:
     """a where that holds, elsewhere b."""
     return tuple([torch.where(where, p, q) for p, q in zip(a, b, strict=True)])
+
+
+def as_one(parts: Sequence[Tensor], dtype: torch.dtype) -> Tensor:
+    """Components ``(*B, N)`` as vectors ``(*B, N, K)`` in a dtype."""
+    derived = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+    if derived or not values_at_hand(parts[0]):
+        return torch.stack(list(parts), dim=-1).to(dtype)
+    # A stack of many short rows takes three times as long.
+    vectors = parts[0].new_empty((*parts[0].shape, len(parts)), dtype=dtype)
+    for k, part in enumerate(parts):
+        vectors.select(-1, k).copy_(part)
+    return vectors

@@ -15,7 +15,7 @@ from torch import Tensor
 from deltas_geom.numerics.ldl import multiply
 from deltas_geom.numerics.null_vector import solve_in_complement
 from deltas_geom.numerics.sums import over_points, product
-from deltas_geom.numerics.vectors import Vector3, Vector4, dot, either, minus, scaled
+from deltas_geom.numerics.vectors import Vector3, Vector4, as_one, dot, either, minus, scaled
 from deltas_geom.triangulation.equations import Equations, Rig, out_of_frame
 from deltas_geom.triangulation.observed import Observations, homogeneous_in_views, inverted
 from deltas_geom.triangulation.solution import of_length_one, of_trace_one
@@ -82,7 +82,7 @@ def gradients_of(
         across, down, along, below = x * c - a, y * c - b, x * f - d, y * f - e
         by_x = torch.addcmul(f * across, c, along) * -known.squared
         by_y = torch.addcmul(f * down, c, below) * -known.squared
-        found: tuple[Tensor, ...] = (torch.stack([by_x.to(dtype), by_y.to(dtype)], dim=-1),)
+        found: tuple[Tensor, ...] = (as_one((by_x, by_y), dtype),)
         if signs:
             by_weight = product(rig.moments[0].mT, torch.stack(framed, dim=-2))
             by_weight = by_weight - torch.addcmul(across * along, down, below)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.numerics.arithmetic import surely_all
-from deltas_geom.numerics.vectors import Vector3
+from deltas_geom.numerics.vectors import Vector3, as_one
 from deltas_geom.triangulation.adjoint import gradients_of
 from deltas_geom.triangulation.equations import Equations, Frame, Rig, alike_of, equations_of
 from deltas_geom.triangulation.judge import ok
@@ -46,7 +46,7 @@ class LongWay:
     def solved(self, *seen: Any) -> tuple[Tensor, Tensor]:
         """Points in the solver's type and their status, without gradient."""
         _, points, status = self.placed(*seen, derivable=False)
-        return torch.stack(points, dim=-1), status
+        return as_one(points, points[0].dtype), status
 
     def points(self, *seen: Any, derivable: bool = False) -> tuple[Tensor]:
         """Points alone."""
@@ -129,8 +129,11 @@ class LongWay:
 
     def _outward(self, points: Vector3) -> Tensor:
         """Three ``(*B, N)`` as ``(*B, N, 3)`` of the caller's type."""
-        return torch.stack([self._fitting(component) for component in points], dim=-1)
+        return as_one([self._clamped(component) for component in points], self.dtype)
 
     def _fitting(self, values: Tensor) -> Tensor:
+        return self._clamped(values).to(self.dtype)
+
+    def _clamped(self, values: Tensor) -> Tensor:
         limit = torch.finfo(self.dtype).max
-        return values.clamp(-limit, limit).to(self.dtype)
+        return values.clamp(-limit, limit)

@@ -23,6 +23,7 @@ from deltas_geom.numerics.arithmetic import (
 )
 from deltas_geom.numerics.chunks import Cut
 from deltas_geom.numerics.evaluation import differentiated, recomputed
+from deltas_geom.numerics.vectors import as_one
 
 _LARGEST = 1e30  # of a coefficient, or a pixel in focal lengths
 _FAR = 1e60  # of a coordinate
@@ -116,7 +117,7 @@ def _reach(model: str, coefficients: Tensor) -> Tensor:
 
 
 def _pixels(
-    model: str, derivable: bool, K: Tensor, coefficients: Tensor, reach: Tensor, points: Tensor
+    model: str, _: bool, K: Tensor, coefficients: Tensor, reach: Tensor, points: Tensor
 ) -> _Both:
     fx, skew, cx, fy, cy = entries_of(K)
     xyz, finite = finite_or_zero(points.to(K.dtype), limit=_FAR)
@@ -126,7 +127,7 @@ def _pixels(
     largest = torch.finfo(points.dtype).max
     valid = seen & (x.abs() < largest) & (y.abs() < largest)
     valid = valid if finite is None else valid & finite.squeeze(-1)
-    return _together((x, y), valid, points.dtype, derivable), valid
+    return _together((x, y), valid, points.dtype), valid
 
 
 def _rays(
@@ -149,19 +150,10 @@ def _rays(
     u, v = only(u, small), only(v, small)
     *ray, valid = MODELS[model].rays(_terms(coefficients), reach, u, v, derivable)
     valid = only(valid, small, finite if finite is None else finite.squeeze(-1), other=False)
-    return _together(ray, valid, pixels.dtype, derivable), valid
+    return _together(ray, valid, pixels.dtype), valid
 
 
-def _together(
-    parts: Sequence[Tensor], valid: Tensor, dtype: torch.dtype, derivable: bool
-) -> Tensor:
+def _together(parts: Sequence[Tensor], valid: Tensor, dtype: torch.dtype) -> Tensor:
     """The parts, 0 where not valid, in one tensor."""
     known = unless_all(valid)
-    parts = [only(part, known) for part in parts]
-    if derivable:
-        return torch.stack(parts, dim=-1).to(dtype)
-    # A stack of many short rows takes ten times as long.
-    found = parts[0].new_empty((*valid.shape, len(parts)), dtype=dtype)
-    for k, part in enumerate(parts):
-        found.select(-1, k).copy_(part)
-    return found
+    return as_one([only(part, known) for part in parts], dtype)
