@@ -1,5 +1,6 @@
 """Small text files that people write: a few words on each line, and comments."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,6 +8,17 @@ from deltas_nets.errors import UserError
 
 TEXT_LIMIT = 256 * 2**20
 """Bytes. Two million lines of poses are less."""
+
+
+def in_commas(words: str) -> str:
+    """What to add where numbers are expected and words hold decimal commas; else nothing.
+
+    Example:
+        >>> in_commas("0,5 -1,25")
+        ' (decimal commas: write 0.5, not 0,5)'
+    """
+    found = re.search(r"(?:^|\s)-?\d+,\d+(?:e[+-]?\d+)?(?:\s|$)", words)
+    return " (decimal commas: write 0.5, not 0,5)" if found else ""
 
 
 def read_text(path: Path, *, name: str, remedy: str) -> str:
@@ -64,5 +76,6 @@ def read_numbers(path: Path, *, name: str, remedy: str) -> list[float]:
             numbers.append(float(word))
         except ValueError as error:
             what = f"the {name} file holds {word[:20]!r} where a number should be"
+            what += in_commas(word)
             raise UserError(what, path, remedy) from error
     return numbers

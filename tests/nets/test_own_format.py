@@ -244,6 +244,24 @@ def test_broken_tables_are_one_error(tmp_path: Path, file: str, content: str | b
         open_capture(write(tmp_path, points="points.csv", observations="observations.csv"))
 
 
+def test_a_csv_of_a_spreadsheet_with_decimal_commas_says_the_same(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "frames.json").unlink()
+    pose = " ".join(f"{number:g}" for number in (AHEAD + 0.5 * np.eye(4, k=3)).ravel())
+    text = (
+        f"# fx: 9.25\n# units: metres\nid,image,fy,cx,cy,world_from_cam\n7,b.png,9.5,4,3,{pose}\n"
+    )
+    first, second = tmp_path / "points", tmp_path / "commas"
+    for folder, said in ((first, text), (second, text.replace(",", ";").replace(".5", ",5"))):
+        folder.mkdir()
+        (folder / "frames.csv").write_text(
+            said.replace("9.25", "9,25" if folder == second else "9.25")
+        )
+        shutil.copy(tmp_path / "images" / "cam1" / "b.png", folder)
+    assert open_capture(first).fingerprint() == open_capture(second).fingerprint()
+    assert open_capture(second).frame("7").cam_from_world[0, 3] == -0.5
+
+
 @pytest.mark.parametrize(
     "text",
     [

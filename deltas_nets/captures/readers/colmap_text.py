@@ -17,6 +17,7 @@ from deltas_nets.captures.colmap_model import (
     ColmapTracks,
 )
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.text_lines import in_commas
 from deltas_nets.errors import UserError
 
 __all__ = ["read_text_model"]
@@ -79,7 +80,8 @@ def _read_cameras(path: Path) -> dict[int, ColmapCamera]:
             id, width, height = (int(words[place]) for place in (0, 2, 3))
             params = tuple(map(float, words[4:]))
         except ValueError as error:
-            raise _wrong(path, number, "holds a word where a number should be") from error
+            what = f"holds a word where a number should be{in_commas(line)}"
+            raise _wrong(path, number, what) from error
         if len(params) != model.num_params:
             what = f"has {len(params)} parameters; {words[1]} has {model.num_params}"
             raise _wrong(path, number, what)
@@ -106,9 +108,8 @@ def _read_images(path: Path) -> tuple[ColmapImages, ColmapTracks]:
                 continue
             head = _head(line)
             if head is None:
-                raise _wrong(
-                    path, number, "is no image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-                )
+                what = "is no image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+                raise _wrong(path, number, what + in_commas(line))
             heads.append(head[0])
             names.append(head[1])
             number, line = next(lines, (0, ""))

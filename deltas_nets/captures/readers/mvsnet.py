@@ -15,7 +15,7 @@ from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.numbered import numbered_files
 from deltas_nets.captures.readers.poses import cam_from_world
-from deltas_nets.captures.text_lines import read_text
+from deltas_nets.captures.text_lines import in_commas, read_text
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "recognises"]
@@ -108,7 +108,8 @@ def _camera(path: Path) -> _Camera:
             [float(word) for word in part] for part in (words[1:17], words[18:27], words[27:31])
         )
     except ValueError as error:
-        raise UserError("the camera holds words where numbers should be", path, _REMEDY) from error
+        what = f"the camera holds words where numbers should be{in_commas(' '.join(words))}"
+        raise UserError(what, path, _REMEDY) from error
     fx, _, cx, _, fy, cy, *_ = intrinsic
     return _Camera(
         np.array(extrinsic).reshape(4, 4),

@@ -106,13 +106,16 @@ def read_csv(path: Path) -> dict[str, object]:
         raise UserError(what, path, REMEDY) from error
     except UnicodeDecodeError as error:
         raise UserError("the file is not text in UTF-8", path, REMEDY) from error
+    told = [line for line in lines if line.strip() and not line.startswith("#")]
+    # Spreadsheets of countries with decimal commas put semicolons between cells.
+    commas = bool(told) and ";" in told[0] and "," not in told[0]
     root: dict[str, object] = {}
     for line in lines:
         stated = re.fullmatch(r"#\s*(\w+)\s*:\s*(.*?)\s*", line)
         if stated:
-            root[stated[1]] = _value(stated[1], stated[2])
+            root[stated[1]] = _value(stated[1], stated[2], commas)
     try:
-        rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
+        rows = list(csv.reader(told, delimiter=";" if commas else ","))
     except csv.Error as error:
         raise UserError(f"the file is no CSV ({error})", path, REMEDY) from error
     header = [name.strip() for name in rows[0]] if rows else []
@@ -122,16 +125,16 @@ def read_csv(path: Path) -> dict[str, object]:
         if len(row) != len(header):
             what = f"row {number} has {len(row)} cells, the first line {len(header)}"
             raise UserError(what, path, REMEDY)
-    root["frames"] = [_frame(dict(zip(header, row, strict=True))) for row in rows[1:]]
+    root["frames"] = [_frame(dict(zip(header, row, strict=True)), commas) for row in rows[1:]]
     return root
 
 
-def _frame(row: Mapping[str, str]) -> dict[str, object]:
+def _frame(row: Mapping[str, str], commas: bool) -> dict[str, object]:
     """A row as JSON would hold it; empty cells say nothing."""
-    return {key: _value(key, cell) for key, cell in row.items() if cell.strip()}
+    return {key: _value(key, cell, commas) for key, cell in row.items() if cell.strip()}
 
 
-def _value(key: str, cell: str) -> object:
+def _value(key: str, cell: str, commas: bool) -> object:
     """Cells that should be numbers become such; others stay words, which are refused later."""
     cell = cell.strip()
     if key == "sources":
@@ -139,7 +142,7 @@ def _value(key: str, cell: str) -> object:
     if key not in (*_NUMBERS, *_LISTS):
         return cell
     try:
-        numbers = [float(word) for word in cell.split()]
+        numbers = [float(word.replace(",", ".") if commas else word) for word in cell.split()]
     except ValueError:
         return cell
     return numbers if key in _LISTS or len(numbers) != 1 else numbers[0]

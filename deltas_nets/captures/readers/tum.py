@@ -18,7 +18,7 @@ from deltas_nets.captures.images import image_size_of, in_words
 from deltas_nets.captures.readers.names import frame_ids, without_common_folder
 from deltas_nets.captures.readers.poses import cam_from_world_of
 from deltas_nets.captures.readers.trajectory import GAP, Trajectory, nearest_stamps
-from deltas_nets.captures.text_lines import read_text
+from deltas_nets.captures.text_lines import in_commas, read_text
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "read_with", "recognises"]
@@ -183,9 +183,10 @@ def _read_trajectory(path: Path) -> Trajectory:
 
 def _wrong_line(text: str, path: Path) -> UserError:
     """The first line that is no pose."""
+    lines = text.splitlines()
     for number, words in _lines(text):
         if len(words) != 8:
-            what = f"line {number} has {len(words)} numbers, not 8"
+            what = f"line {number} has {len(words)} numbers, not 8{in_commas(lines[number - 1])}"
             return UserError(what, path, _POSE_REMEDY)
         try:
             numbers = [float(word) for word in words]
