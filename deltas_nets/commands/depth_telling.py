@@ -50,15 +50,39 @@ def tell(outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions", f
 def show(capture: "Capture", out: Path, depth_range: tuple[float, float]) -> None:
     """Write the page; maps are worth more, so what hinders it is only a warning."""
     from deltas_nets.outputs.summary import SUMMARY, read_summary
-    from deltas_nets.page.maps import open_maps
-    from deltas_nets.page.write import write_page
 
     if (read_summary(out / SUMMARY) or {}).get("status") != "complete":
         return  # another shard does it
     try:
-        maps = open_maps(capture, out)
-        with progress("page", len(maps.ids)) as report:
-            page = write_page(maps, depth_range=depth_range, report=report)
-        print(page.line)
+        _write(capture, out, depth_range)
     except UserError as error:
         warn(f"no page to look at is written: {error}; deltas page goes on from there")
+
+
+def show_fused(capture: "Capture", depths: Path, fused: Path) -> None:
+    """Write the page of a folder of maps anew, if there is one, with what was fused of them.
+
+    Meshes are worth more: what hinders it is only a warning.
+    """
+    from deltas_nets.outputs.beside import range_of_page
+    from deltas_nets.page.maps import has_fused
+
+    depth_range = range_of_page(depths)
+    if depth_range is None or not has_fused(fused):
+        return
+    try:
+        _write(capture, depths, depth_range, fused)
+    except UserError as error:
+        warn(f"the page is as it was: {error}; deltas page --fused {fused} goes on from there")
+
+
+def _write(
+    capture: "Capture", out: Path, depth_range: tuple[float, float], fused: Path | None = None
+) -> None:
+    from deltas_nets.page.maps import open_maps
+    from deltas_nets.page.write import write_page
+
+    maps = open_maps(capture, out, fused)
+    with progress("page", len(maps.ids)) as report:
+        page = write_page(maps, depth_range=depth_range, report=report)
+    print(page.line)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
+from deltas_nets.commands.depth_telling import show_fused
 from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import counted, progress, warn
@@ -24,6 +25,7 @@ class Fuse(Command):
     Each map is compared with those of frames that see the same: depth stays where they agree, as
     far as the maps' own deviation lets expect. Writes DIR/cloud.ply (points with colours and
     normals), DIR/mesh.ply (coloured vertices) and DIR/fuse.json, in the capture's world and unit.
+    Where DEPTHS has a page, index.html, it shows them then.
 
     Example: deltas fuse my_capture my_capture-depth
 
@@ -89,6 +91,7 @@ class Fuse(Command):
                 raise UserError("no scale", f"--scale {self.scale:g}", "give a positive number")
             capture = scaled(capture, self.scale)
         self.fuse(capture, out)
+        show_fused(capture, self.depths, out)
 
     def fuse(self, capture: "Capture", out: Path) -> None:
         """Fuse maps of a capture that is open."""

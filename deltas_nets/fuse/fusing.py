@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,23 +10,22 @@ from typing import Any, NamedTuple
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.cloud import Cloud
 from deltas_nets.fuse.config import FuseConfig
+from deltas_nets.fuse.folder import check_folder, own_files
 from deltas_nets.fuse.left_out import LeftOut, cure, doubt, mean_left_out
 from deltas_nets.fuse.mesh import without_small_parts
 from deltas_nets.fuse.prepared import PreparedViews
 from deltas_nets.fuse.products import FUSED, FusedName
 from deltas_nets.fuse.sizes import Sizes, check_memory, look_at
 from deltas_nets.fuse.sources import DepthSource
-from deltas_nets.fuse.state import STATE, Sums, read_state, write_state
+from deltas_nets.fuse.state import Sums, read_state, write_state
 from deltas_nets.fuse.surface import surface
 from deltas_nets.fuse.threads import own_threads
 from deltas_nets.fuse.volume import BYTES_OF_BLOCK, Volume
 from deltas_nets.outputs.atomic_files import check_writable, plain, write_json
-from deltas_nets.outputs.summary import difference
+from deltas_nets.outputs.beside import FUSE_STATE, FUSE_SUMMARY, FUSE_WRITER
 
 __all__ = ["Fused", "fuse_capture"]
 
-SUMMARY = "fuse.json"
-WRITER = "deltas fuse"
 SECONDS_BETWEEN_STATES = 20.0
 SHARE_OF_STATES = 0.1
 """Of the time that goes into writing states, at most."""
@@ -88,7 +87,7 @@ def fuse_capture(
     check_writable(out)
     settings = json.loads(json.dumps(plain({**asdict(config), **source.settings})))
     settings["frames"] = list(source.ids)
-    earlier = _check_folder(out, files.values(), settings, overwrite)
+    earlier = check_folder(out, files.values(), settings, overwrite=overwrite)
     if earlier and earlier["status"] == "complete" and all(map(Path.exists, files.values())):
         return Fused(len(source.ids), earlier["voxel"], {}, list(files.values()))
     source.check()
@@ -98,53 +97,26 @@ def fuse_capture(
         if "surface" in kinds:
             check_memory(sizes, gigabytes)
         sums = _sums(kinds, sizes, device, threads)
-        head = {"writer": WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}
         out.mkdir(parents=True, exist_ok=True)
-        write_json(out / SUMMARY, {**head, "status": "running", "settings": settings})
+        head = {"writer": FUSE_WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}
+        head["files"] = own_files(out, files.values(), settings)
+        write_json(out / FUSE_SUMMARY, {**head, "status": "running", "settings": settings})
         left_out = _add_up(source, out, config, sums, settings, gigabytes, report)
         made, counts = _made(sums, sizes)
         if not all(counts.values()):
             # No settings hold the folder then: other ones, as the remedy has them, may follow.
-            (out / SUMMARY).unlink(missing_ok=True)
-            (out / STATE).unlink(missing_ok=True)
+            (out / FUSE_SUMMARY).unlink(missing_ok=True)
+            (out / FUSE_STATE).unlink(missing_ok=True)
             raise _nothing(source, left_out, sizes, config)
         for name, file in files.items():
             FUSED[name].write(file, made[FUSED[name].of])
     ended = {"status": "complete", "frames": len(source.ids), **counts}
     ended["left_out"] = {name: round(part, 4) for name, part in left_out._asdict().items()}
-    write_json(out / SUMMARY, {**head, **ended, "settings": settings})
-    (out / STATE).unlink(missing_ok=True)
+    write_json(out / FUSE_SUMMARY, {**head, **ended, "settings": settings})
+    (out / FUSE_STATE).unlink(missing_ok=True)
     doubtful = doubt(counts, left_out, sizes, config)
     made_now = list(files.values())
     return Fused(len(source.ids), sizes.voxel, counts, made_now, left_out, doubtful)
-
-
-def _check_folder(
-    out: Path, files: Iterable[Path], settings: Mapping[str, Any], overwrite: bool
-) -> dict[str, Any] | None:
-    """What an earlier run of the same settings left; refuse what others made."""
-    earlier = _read_summary(out / SUMMARY)
-    if earlier is not None and earlier["settings"] == settings:
-        return earlier
-    if overwrite:
-        return None
-    if earlier is not None:
-        what = f"an earlier run had other settings ({difference(earlier, settings)})"
-        raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
-    for file in files:
-        if file.exists():
-            what = "the file exists"
-            raise UserError(what, file, "name another folder, or add --overwrite")
-    return None
-
-
-def _read_summary(path: Path) -> dict[str, Any] | None:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    ours = isinstance(content, dict) and content.get("writer") == WRITER
-    return content if ours and "settings" in content and "status" in content else None
 
 
 def _sums(kinds: Collection[str], sizes: Sizes, device: str, threads: int) -> dict[str, Sums]:

@@ -12,10 +12,9 @@ from safetensors.torch import save_file
 from deltas_nets.fuse.depth_view import DepthView
 from deltas_nets.fuse.left_out import LeftOut
 from deltas_nets.outputs.atomic_files import write_atomically
+from deltas_nets.outputs.beside import FUSE_STATE
 
-__all__ = ["STATE", "Sums", "read_state", "write_state"]
-
-STATE = "fuse.state.safetensors"
+__all__ = ["Sums", "read_state", "write_state"]
 
 
 class Sums(Protocol):
@@ -46,7 +45,7 @@ def write_state(
     }
     metadata = {"done": json.dumps(done), "settings": json.dumps(settings)}
     # By its name: in memory the bytes would be there twice.
-    write_atomically(folder / STATE, lambda file: save_file(tensors, file.name, metadata))
+    write_atomically(folder / FUSE_STATE, lambda file: save_file(tensors, file.name, metadata))
 
 
 def read_state(
@@ -59,7 +58,7 @@ def read_state(
         settings left any.
     """
     try:
-        with safe_open(str(folder / STATE), framework="pt") as opened:
+        with safe_open(str(folder / FUSE_STATE), framework="pt") as opened:
             metadata = opened.metadata() or {}
             if metadata.get("settings") != json.dumps(settings):
                 return {}

@@ -25,6 +25,7 @@ from deltas_nets.outputs.atomic_files import (
     plain,
     write_json,
 )
+from deltas_nets.outputs.beside import remove_beside
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.journal import Journal, read_journals, remove_journals
 from deltas_nets.outputs.products import (
@@ -157,8 +158,9 @@ def prepare_output(
         out: the folder; its parents are made too.
         settings: what the results depend on (weights, views, sizes ...; not the device or
             the shard). A run continues another only where all of it is equal.
-        overwrite: start again: remove the frames that earlier runs were to write, and use a folder
-            with other contents, in which only files of the same names are replaced.
+        overwrite: start again: remove the frames that earlier runs were to write and what shows
+            them (`deltas_nets.outputs.beside`), and use a folder with other contents, in which only
+            files of the same names are replaced.
         forbidden: the capture. Its own depth/ would be overwritten, so it is never an output.
         shard: which of how many runs that fill the folder this is, from 1.
         frame_ids: the frames of this run: what ``overwrite`` removes where others work too.
@@ -215,8 +217,9 @@ def prepare_output(
         # Before the new summary: killed in between, the old one still says what made the rest.
         out.mkdir(parents=True, exist_ok=True)
         if overwrite:
-            planned = {str(id) for summary in earlier for id in summary.get("anchors", ())}
-            _remove_frames(out, {*frame_ids, *(planned if shard[1] == 1 else ())})
+            old = {*frame_ids, *_not_planned(earlier, wanted, alone=shard[1] == 1)}
+            remove_beside(out, old, earlier[0]["settings"] if earlier else None)
+            _remove_frames(out, old)
             if shard[1] == 1:
                 _remove_shard_summaries(out)
                 FirstMaps.remove_all(out)
@@ -231,6 +234,24 @@ def prepare_output(
     except OSError as error:
         raise cannot_write(Path(error.filename or out), error) from error
     return folder
+
+
+def _not_planned(
+    earlier: Iterable[Mapping[str, Any]], wanted: Mapping[str, Any], *, alone: bool
+) -> set[str]:
+    """Frames that earlier runs were to write and no run of ours writes now.
+
+    Args:
+        earlier: summaries.
+        wanted: the settings of now, which name the frames of all shards.
+        alone: no other shard is at work.
+    """
+    planned = {str(id) for summary in earlier for id in summary.get("anchors", ())}
+    if alone:
+        return planned
+    # Others may have written theirs by now.
+    view_sets = wanted.get("view_sets")
+    return planned - {str(anchor) for anchor, _ in view_sets} if view_sets else set()
 
 
 def _remove_frames(out: Path, ids: Iterable[str]) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from deltas_nets import __version__
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, mean_metrics
+from deltas_nets.outputs.beside import mark_of_page
 from deltas_nets.outputs.verdict import verdict
 from deltas_nets.page.colours import NONE, Scale, lookup_table, ticks_of
 from deltas_nets.page.maps import Maps
@@ -96,6 +97,7 @@ def html_of(
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     page = _asset("page.html")
     for name, content in (
+        ("<!--mark-->", mark_of_page(depth_range)),
         ("/*style*/", _asset("page.css")),
         ("/*program*/", _asset("scene.js") + _asset("page.js")),
         ("/*data*/", text),

@@ -17,7 +17,7 @@ from deltas_nets.outputs.summary import recorded_depth_scale
 from deltas_nets.outputs.their_capture import METRE, made_of, map_file
 from deltas_nets.terminal import warn
 
-__all__ = ["Maps", "open_maps"]
+__all__ = ["Maps", "has_fused", "open_maps"]
 
 FUSED = ("mesh.ply", "cloud.ply")
 """What `deltas fuse` writes."""
@@ -101,6 +101,11 @@ class Maps(NamedTuple):
         return points.astype(np.float64), colors
 
 
+def has_fused(folder: Path) -> bool:
+    """Whether a folder holds what the page shows of `deltas fuse`."""
+    return any((folder / name).exists() for name in FUSED)
+
+
 def open_maps(capture: Capture, folder: Path, fused: Path | None = None) -> Maps:
     """The maps of a capture; those that are missing are named in a warning.
 
@@ -113,7 +118,7 @@ def open_maps(capture: Capture, folder: Path, fused: Path | None = None) -> Maps
         UserError: the folder is none of `deltas depth`, its maps are of another capture, or there
             is not a single one; or nothing fused is where it is said to be.
     """
-    if fused is not None and not any((fused / name).exists() for name in FUSED):
+    if fused is not None and not has_fused(fused):
         raise UserError(f"there is no {' or '.join(FUSED)}", fused, "run deltas fuse first")
     capture, ids, missing, summary = made_of(capture, folder)
     if missing:

@@ -10,6 +10,7 @@ from PIL import Image
 
 from deltas_nets.evaluate.scores import resize_nearest
 from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically
+from deltas_nets.outputs.beside import PAGE, PREVIEWS, SHEET, preview_file
 from deltas_nets.page.budget import MOST_BYTES, choose
 from deltas_nets.page.colours import Scale, coloured, depth_scale, with_bar
 from deltas_nets.page.html import ShownFrame, bytes_of_frame, bytes_of_layer, html_of, shown_frame
@@ -20,7 +21,6 @@ from deltas_nets.page.sheet import MOST_CELLS, cell_of, contact_sheet
 
 __all__ = ["Page", "write_page"]
 
-PAGE, SHEET, PREVIEWS = "index.html", "contact_sheet.jpg", "preview"
 PREVIEW_LONGEST, QUALITY = 1024, 90
 BYTES_OF_CAMERA = 160
 FRAME_OF_PAGE = 100_000
@@ -84,7 +84,7 @@ def write_page(
     frames, cells = [], []
     for id in maps.ids:
         depth = maps.depth(id)
-        _write_preview(folder / PREVIEWS / f"{id}.jpg", depth, scale)
+        _write_preview(preview_file(folder, id), depth, scale)
         if id in on_page:
             found = pictures_of(maps, id, depth, scale, depth_range, chosen.longest)
             frames.append(shown_frame(found))

@@ -18,11 +18,11 @@ from deltas_nets.captures.opening import open_capture
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.errors import UserError
 from deltas_nets.fuse import FuseConfig
-from deltas_nets.fuse.fusing import SUMMARY, fuse_capture
+from deltas_nets.fuse.fusing import fuse_capture
 from deltas_nets.fuse.left_out import LeftOut, cure
 from deltas_nets.fuse.sizes import _up, check_memory, look_at
 from deltas_nets.fuse.sources import depth_source
-from deltas_nets.fuse.state import STATE
+from deltas_nets.outputs.beside import FUSE_STATE, FUSE_SUMMARY
 
 FEW = ("--neighbours", "2")
 
@@ -47,9 +47,9 @@ def vertices_of(path: Path) -> np.ndarray:
 def test_maps_become_a_cloud_and_a_mesh(maps: tuple[Path, Path], tmp_path: Path, run: Run) -> None:
     result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05)
     assert result.code == 0, result.err
-    summary = json.loads((tmp_path / "out" / SUMMARY).read_text())
+    summary = json.loads((tmp_path / "out" / FUSE_SUMMARY).read_text())
     assert summary["status"] == "complete"
-    assert not (tmp_path / "out" / STATE).exists()
+    assert not (tmp_path / "out" / FUSE_STATE).exists()
     for name, count in (("cloud", "points"), ("mesh", "vertices")):
         points = vertices_of(tmp_path / "out" / f"{name}.ply")
         assert len(points) == summary[count] > 100
@@ -63,7 +63,7 @@ def test_sensor_depth_has_no_need_of_maps(
 ) -> None:
     result = run("fuse", make_capture(), "sensor", "--out", tmp_path / "out", "--cloud")
     assert result.code == 0, result.err
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["cloud.ply", SUMMARY]
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["cloud.ply", FUSE_SUMMARY]
     assert abs(vertices_of(tmp_path / "out" / "cloud.ply")[:, 2] - 2.5).max() < 1e-3
 
 
@@ -90,7 +90,7 @@ def test_a_stopped_run_goes_on_and_ends_the_same(maps: tuple[Path, Path], tmp_pa
 
     with pytest.raises(KeyboardInterrupt):
         fuse_capture(source, tmp_path / "stopped", config, report=stop)
-    assert (tmp_path / "stopped" / STATE).exists()
+    assert (tmp_path / "stopped" / FUSE_STATE).exists()
     fuse_capture(source, tmp_path / "stopped", config, report=added.append)
     assert added == [*source.ids[:2], *source.ids]
     for name in ("cloud.ply", "mesh.ply"):
@@ -101,7 +101,7 @@ def test_a_stopped_run_goes_on_and_ends_the_same(maps: tuple[Path, Path], tmp_pa
 def test_a_state_that_is_cut_is_begun_anew(maps: tuple[Path, Path], tmp_path: Path) -> None:
     source = depth_source(open_capture(maps[0]), maps[1])
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / STATE).write_bytes(b"\x10")
+    (tmp_path / "out" / FUSE_STATE).write_bytes(b"\x10")
     fused = fuse_capture(source, tmp_path / "out", FuseConfig(voxel=0.05, neighbours=2))
     assert fused.counts["points"] > 100
 
@@ -204,7 +204,7 @@ def test_what_is_left_out_is_told(maps: tuple[Path, Path], tmp_path: Path, run: 
     Image.fromarray(steps).save(file)
     result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05)
     assert "50% is less sure than --min-confidence 0.3, " in result.out
-    left_out = json.loads((tmp_path / "out" / SUMMARY).read_text())["left_out"]
+    left_out = json.loads((tmp_path / "out" / FUSE_SUMMARY).read_text())["left_out"]
     assert left_out["doubtful"] == 0.5 and 0.0625 <= left_out["unconfirmed"] < 0.1
 
 
