@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.captures.sets_file import sets_file
 from deltas_nets.captures.view_choice import ChosenViews, choose_views
 from deltas_nets.captures.view_sets import (
     ViewSet,
@@ -42,7 +43,7 @@ def usable_view_sets(
 
     Args:
         capture: the frames.
-        file: of view sets, or None.
+        file: of view sets, which may lie in the capture, or None.
         num_views: at most so many; as many as there are, or 5 of chosen ones, if not given.
         working_depth: as for `deltas_nets.captures.view_choice.choose_view_sets`.
         anchors: frames that want a set, where no file says it; all if not given.
@@ -51,7 +52,7 @@ def usable_view_sets(
         raise UserError("too few views", f"--views {num_views}", "use 2 or more")
     wanted = num_views or FEW
     if file is not None:
-        view_sets = read_view_sets(file, capture)
+        view_sets = read_view_sets(sets_file(file, capture.path), capture)
         wanted = num_views or 2
     elif capture.sources is not None:
         chosen = capture.frames if anchors is None else anchors
@@ -72,21 +73,16 @@ def usable_view_sets(
     return UsableViews(view_sets, sum(len(views.sources) < wanted - 1 for views in view_sets))
 
 
-def sets_file(file: Path | None, capture: Path) -> Path | None:
-    """The file of view sets: as it is named or, if it is not there, of that name in the capture."""
-    return capture / file if file is not None and not file.exists() else file
-
-
 def lone_frames(capture: Capture, file: Path | None, anchors: Sequence[str] | None) -> UsableViews:
     """Anchors without sources, for maps that rest on measured depth alone.
 
     Args:
         capture: the frames.
-        file: of view sets, whose anchors are meant, or None.
+        file: of view sets, whose anchors are meant, or None; it may lie in the capture.
         anchors: the frames, where no file says it; all if not given.
     """
     if file is not None:
-        anchors = [views.anchor for views in read_view_sets(file, capture)]
+        anchors = [views.anchor for views in read_view_sets(sets_file(file, capture.path), capture)]
     chosen = capture.frames if anchors is None else anchors
     return UsableViews(tuple(ViewSet(id, ()) for id in chosen), 0)
 

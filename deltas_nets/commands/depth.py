@@ -52,7 +52,8 @@ class Depth(Captured, Measuring, Prediction):
     """Nearest and farthest depth searched, in the capture's unit. If not given it follows from the
     capture for each frame: its ranges, its sparse points, or a first look; 0.5 10 in rooms."""
     view_sets: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...]; chosen by angle and overlap if not given."""
+    """JSON: [{"anchor": 10, "sources": [8, 12]}, ...], here or in the capture; chosen by angle and
+    overlap if not given."""
     views: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Views per depth map, the anchor included; all of the view sets', or 5, if not given."""
     keyframes: Flag = False

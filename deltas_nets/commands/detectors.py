@@ -56,7 +56,6 @@ class Detectors(Command):
     """Show the traceback of an error."""
 
     checks: ClassVar = {
-        "view_sets": lambda value, flag: None,  # it may lie in the capture
         "sets": at_least_one,
         "num_points": at_least_one,
         "nms_radius": not_negative,
@@ -94,7 +93,7 @@ class Detectors(Command):
         from rich.console import Console
 
         from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.usable import check_all, sets_file, usable_view_sets
+        from deltas_nets.captures.usable import check_all, usable_view_sets
         from deltas_nets.evaluate.detectors.capture import pairs_of, score_capture
         from deltas_nets.evaluate.detectors.registry import load_extractors
         from deltas_nets.evaluate.detectors.report import (
@@ -107,8 +106,7 @@ class Detectors(Command):
 
         config, extractors = self._config(), load_extractors(self.detectors)
         capture = open_capture(self.capture)
-        file = sets_file(self.view_sets, self.capture)
-        usable = usable_view_sets(capture, file, self.views).view_sets
+        usable = usable_view_sets(capture, self.view_sets, self.views).view_sets
         view_sets = tuple(evenly_spaced(usable, self.sets))
         pairs = pairs_of(capture, view_sets)
         check_all(capture, view_sets)

@@ -78,12 +78,10 @@ class Evaluate(Prediction):
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also write a row for each frame to this file."""
 
-    # A file of view sets may lie in each scene, and is looked for once these are known.
     checks: ClassVar[Mapping[str, Callable[[Any, str], object]]] = {
         "gap": at_least_one,
         "sets": at_least_one,
         "every": at_least_one,
-        "view_sets": lambda value, flag: None,
     }
 
     def run(self) -> None:
@@ -145,7 +143,7 @@ class Evaluate(Prediction):
         from deltas_nets.evaluate.protocols.view_protocol import ViewProtocol
 
         file = self.view_sets
-        if file is not None and (many or not file.exists()):
+        if file is not None and many:
             file = path / file
         predictions = self.predictions
         if predictions is not None and many:

@@ -42,7 +42,6 @@ class MeasuredSeries(Command):
 
     going_on: ClassVar[str] = "start it again; what is done is kept"
     checks: ClassVar = {
-        "view_sets": lambda value, flag: None,  # it may lie in the capture
         "sets": at_least_one,
         "seed": not_negative,
     }
@@ -64,7 +63,6 @@ class MeasuredSeries(Command):
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.usable import (
             check_all,
-            sets_file,
             usable_view_sets,
             with_depth_only,
         )
@@ -77,8 +75,7 @@ class MeasuredSeries(Command):
         check_writable(self.out)
         device = usable_device(self.device)
         capture = open_capture(path).remembering()
-        file = sets_file(self.view_sets, path)
-        usable = usable_view_sets(capture, file, self.views or num_views).view_sets
+        usable = usable_view_sets(capture, self.view_sets, self.views or num_views).view_sets
         view_sets = tuple(evenly_spaced(with_depth_only(capture, usable), self.sets))
         check_all(capture, view_sets, with_depth=True)
         measurement = Measurement(capture, view_sets, config, self.seed)

@@ -31,6 +31,10 @@ def check_values(command: Command) -> None:
         check = command.checks.get(field.name) or CHECKS.get(field.name)
         if value is not None and check is not None:
             check(value, f"--{field.name.replace('_', '-')}")
+    # Of several scenes it lies in each, and is looked for once these are known.
+    sets, capture = getattr(command, "view_sets", None), getattr(command, "capture", None)
+    if sets is not None and capture is not None:
+        _view_sets(sets, capture)
     if getattr(command, "views", None) == 1 and getattr(command, "sensor_depth", None) is None:
         completes = hasattr(command, "sensor_depth")
         remedy = "use 2 views or more"
@@ -119,6 +123,14 @@ def _file(value: Path, flag: str) -> None:
         raise UserError("the file does not exist", f"{flag} {value}", "check the path")
 
 
+def _view_sets(value: Path, capture: Path) -> None:
+    from deltas_nets.captures.sets_file import sets_file
+
+    if not sets_file(value, capture).is_file():
+        what = "the file does not exist, in the capture neither"
+        raise UserError(what, f"--view-sets {value}", "check the path")
+
+
 def _depths(value: Path, flag: str) -> None:
     if str(value) not in ("sensor", "points"):
         _file(value, flag)
@@ -149,7 +161,6 @@ CHECKS: Mapping[str, Callable[[Any, str], object]] = {
     "depth_scale": _positive,
     "min_confidence": _part,
     "capture": _capture,
-    "view_sets": _file,
     "scale_from": _depths,
     "intrinsics": _intrinsics,
 }

@@ -1,5 +1,6 @@
 """View sets: a file that names them, a rule that chooses them, and the check of both."""
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,15 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_command import Run, assert_one_line
 from small_capture import write_view_sets
 
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
-from deltas_nets.captures.usable import sets_file
+from deltas_nets.captures.sets_file import sets_file
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.summary import recorded_view_sets
 
 MakeCapture = Callable[..., Path]
 
@@ -202,7 +205,29 @@ def test_a_file_of_view_sets_may_lie_in_the_capture(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     capture, file = Path("capture"), Path("sets.json")
-    assert sets_file(None, capture) is None
+    capture.mkdir()
+    (capture / "transforms.json").touch()
+    assert sets_file(file, capture) == file  # which is nowhere, as errors say
+    (capture / file).touch()
+    assert sets_file(file, capture) == sets_file(file, capture / "transforms.json")
     assert sets_file(file, capture) == capture / file
     file.touch()
     assert sets_file(file, capture) == file
+
+
+def test_depth_and_evaluation_find_the_same_view_sets_in_a_capture(
+    make_capture: MakeCapture, run: Run, tmp_path: Path
+) -> None:
+    """Their names are those of the file, wherever the command is started."""
+    path = make_capture()
+    (path / "sets.json").write_text('[{"anchor": 2, "sources": [1, 3]}]')
+    asked = (path, "--view-sets", "sets.json", "--weights", "plane-sweep")
+    done = run("depth", *asked, "--no-page", "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    assert recorded_view_sets(tmp_path / "out") == (ViewSet("2", ("1", "3")),)
+    done = run("evaluate", *asked, "--json", tmp_path / "scores.json")
+    assert done.code == 0, done.err
+    frames = json.loads((tmp_path / "scores.json").read_text())["frames"]
+    assert [(frame["frame"], frame["sources"]) for frame in frames] == [("2", "1 3")]
+    refused = run("depth", path, "--view-sets", "none.json", "--out", tmp_path / "none")
+    assert_one_line(refused, "does not exist, in the capture neither", "--view-sets none.json")
