@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 
 from torch import nn
 
+from deltas_nets import __version__
 from deltas_nets.ablations.journal import Journal, key_of
 from deltas_nets.ablations.steps import Series, Step
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.cost.literature import PAPER_SETTING
 from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import gmacs
 from deltas_nets.errors import UserError
@@ -27,8 +29,6 @@ __all__ = ["Measured", "Measurement", "measure"]
 
 METRICS = ("abs_rel", "abs_diff", "sq_rel", "delta1", "delta2", "delta3")
 """The supplement's."""
-PAPER_VIEWS, PAPER_SIZE, PAPER_POINTS = 2, (240, 320), 512
-"""At which the paper counts GMACs."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,7 @@ class Measurement:
                 "search": step.search,
                 "seed": self.seed,
                 "metrics": METRICS_VERSION,
+                "deltas": __version__,
             }
         )
 
@@ -148,7 +149,7 @@ def _cost(predictor: Predictor) -> dict[str, Any]:
     network = _network_of(predictor)
     if network is None:
         return {}
-    cost = cost_of(network, PAPER_VIEWS, PAPER_SIZE, PAPER_POINTS, repeats=1).total
+    cost = cost_of(network, *PAPER_SETTING, repeats=1).total
     return {"gmacs": gmacs(cost.flops.products), "parameters": cost.parameters}
 
 

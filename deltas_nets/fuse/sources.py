@@ -4,10 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from deltas_geom import Lens
@@ -20,6 +17,7 @@ from deltas_nets.captures.straight import StraightFrame, photo_pixels, straight
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.depth_view import DepthView
 from deltas_nets.fuse.deviation import std_of_confidence, std_of_sensor
+from deltas_nets.outputs.confidence_maps import confidence_file, read_confidence
 from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale
 from deltas_nets.outputs.their_capture import made_of
@@ -129,12 +127,10 @@ class Predicted:
         depth = torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
         confidence = None
         if self._has_confidence:
-            confidence = torch.from_numpy(
-                _read_confidence(self._folder / "confidence" / f"{id}.png")
-            )
+            confidence = torch.from_numpy(read_confidence(self._folder, id))
             if confidence.shape != depth.shape:
                 what = "the confidence is not of the depth map's size"
-                raise UserError(what, self._folder / "confidence" / f"{id}.png", MAKE_ANEW)
+                raise UserError(what, confidence_file(self._folder, id), MAKE_ANEW)
             known = depth > 0
             depth = torch.where(confidence >= self._least, depth, 0.0)
             kept = int((depth > 0).sum()) / max(1, int(known.sum()))
@@ -172,15 +168,6 @@ class Sensed:
         if frame.depth_K is None and frame.cam_from_depth is None:
             return _of_photo(frame, depth, std, most=MOST_SENSED)
         return _of_own_camera(frame, depth, std)
-
-
-def _read_confidence(path: Path) -> NDArray[np.uint8]:
-    try:
-        with Image.open(path) as image:
-            return np.array(image.convert("L"))
-    except (OSError, SyntaxError, ValueError) as error:
-        what = f"the confidence map cannot be read ({error})"
-        raise UserError(what, path, MAKE_ANEW) from error
 
 
 def _step(size: tuple[int, int], most: int) -> int:

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.confidence_maps import confidence_file, read_confidence
 from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.products import read_points_ply
 from deltas_nets.outputs.summary import recorded_depth_scale
@@ -72,15 +72,9 @@ class Maps(NamedTuple):
         Raises:
             UserError: the file cannot be read.
         """
-        file = self.folder / "confidence" / f"{id}.png"
-        if not file.exists():
+        if not confidence_file(self.folder, id).exists():
             return None
-        try:
-            with Image.open(file) as image:
-                return np.asarray(image.convert("L")).astype(np.float32) / np.float32(255)
-        except (OSError, SyntaxError, ValueError) as error:
-            what = f"the confidence cannot be read ({error})"
-            raise UserError(what, file, MAKE_ANEW) from error
+        return read_confidence(self.folder, id).astype(np.float32) / np.float32(255)
 
     def points(self, id: str) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
         """Points ``(N, 3)`` of a frame's map in the world, and their colours; None without a file.
