@@ -1,14 +1,15 @@
 """Ours, what needs no learning, a cost volume and networks of others: one run, one table.
 
-    python benchmarks/baselines.py CAPTURE [VIEWS] [SETS] [--volume FILE] [--ours FILE]
-        [--peers PEERS/run.py] [--only NAME ...] [--json FILE]
+    python benchmarks/baselines.py CAPTURE [VIEWS] [SETS] [--threads N] [--volume FILE]
+        [--ours FILE] [--peers PEERS/run.py] [--only NAME ...] [--json FILE]
 
 CAPTURE has view_sets.json and sensor depth; SETS of its sets are looked at, by all methods the
 same. Each method runs in a process of its own, whose peak memory is in the table together with
 that of a process that does nothing but load torch and the images. --volume names weights of the
 cost-volume network, --ours those of the deltas network that was trained as long
 (benchmarks/cost_volume.py makes both). PEERS/run.py is a program with a table MK of networks:
-called with images in BGR, K, poses, NEAR and FAR they give a map.
+called with images in BGR, K, poses, NEAR and FAR they give a map. --json writes a record of
+results, as that of `deltas evaluate` does.
 
 Every map is made anew, nothing is remembered from the one before. GMACs are counted by deltas_nets
 as in `deltas cost`, of one map: those of convolutions and matrix products, and those of all
@@ -19,7 +20,6 @@ import argparse
 import importlib.util
 import json
 import os
-import platform
 import resource
 import subprocess
 import sys
@@ -40,6 +40,7 @@ from deltas_nets.config.baselines import BASELINES
 from deltas_nets.cost.operations import OperationCounter
 from deltas_nets.cost.report import gmacs
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
+from deltas_nets.evaluate.record import Record, command_line, machine, write_record
 from deltas_nets.evaluate.scores import resize_nearest
 from deltas_nets.predict.depth_map import PredictConfig, frames_of
 from deltas_nets.predict.look import look
@@ -174,16 +175,20 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run every method and print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("views", type=int, nargs="?", default=3)
-    parser.add_argument("sets", type=int, nargs="?", default=8)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("capture", type=Path, help="with view_sets.json and sensor depth")
+    parser.add_argument("views", type=int, nargs="?", default=3, help="of a map (3)")
+    parser.add_argument("sets", type=int, nargs="?", default=8, help="maps of each method (8)")
     parser.add_argument("--volume", help="weights of the cost-volume network")
     parser.add_argument("--ours", help="weights of deltas-small, trained as long as it")
-    parser.add_argument("--peers", type=Path, help="their run.py")
-    parser.add_argument("--only", nargs="+", help="names of methods")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--peers", type=Path, help="run.py of networks of others")
+    only = f"of {', '.join((NOTHING, 'deltas-small', *BASELINES, *PEERS))}, or weights"
+    parser.add_argument("--only", nargs="+", metavar="NAME", help=only)
+    threads = "of torch and of what counts like it (all cores)"
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help=threads)
+    parser.add_argument("--json", type=Path, help="file for a record of the table")
     parser.add_argument("--method", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.method:
@@ -199,8 +204,23 @@ def main() -> None:
     title = f"{arguments.capture.name}, {arguments.views} views, {arguments.sets} maps"
     print(f"{title}, {arguments.threads} threads\n\n{table(rows)}")
     if arguments.json is not None:
-        where = {"torch": torch.__version__, "machine": platform.processor()}
-        arguments.json.write_text(json.dumps({"settings": title, "rows": rows} | where, indent=1))
+        write_record(arguments.json, record_of(rows, arguments))
+
+
+def record_of(rows: dict[str, dict[str, Any]], arguments: argparse.Namespace) -> Record:
+    """The table as it is stored."""
+    flat = []
+    for name, row in rows.items():
+        unknown = ", ".join(row.get("without_a_formula", {}))
+        flat.append({"method": Path(name).name, **row, "without_a_formula": unknown})
+    return Record(
+        "baselines",
+        protocol={"views": arguments.views},
+        command=f"python benchmarks/{command_line()}",
+        data=[{"name": arguments.capture.name, "view_sets": arguments.sets}],
+        rows=flat,
+        machine={**machine(), "threads": arguments.threads},
+    )
 
 
 if __name__ == "__main__":

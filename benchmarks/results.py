@@ -1,80 +1,171 @@
 """docs/results.md from stored results, and the stored results of what needs inference alone.
 
-    python benchmarks/results.py measure WALK SCENES7   runs the commands, stores records
+    python benchmarks/results.py measure WALK SCENES7 [--weights DIR] [--pairs DIR]
     python benchmarks/results.py                        writes docs/results.md from the records
 
 WALK and SCENES7 are captures with sensor depth and view_sets.json: here the headset walk and the
-registered 7-Scenes of the tables. Records lie in docs/results; each names its command. What needs
-data or weights of others is not run by `measure` and keeps the record that it has.
+registered 7-Scenes of the tables. --weights holds files of detectors of others (results_parts.py
+has their names), --pairs image pairs without depth: pairs_with_gt.txt and images. All are linked to
+from the folder captures, which git does not see: the records in docs/results name commands that run
+again from there.
+
+`measure` runs two parts at a time, each on one core, says how long the rest takes, and writes the
+page. Stopped, it goes on where it was. Parts are measured again where their commands, what is given
+or the code of the packages changed since; --only NAME ... looks at these parts alone, and --list
+says what would be done. What the commands print is in captures/logs.
 """
 
+import argparse
+import hashlib
+import json
+import os
+import shlex
+import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
+from typing import Any
 
-from deltas_nets.ablations.paper import PAPER
-from deltas_nets.evaluate.record import Record, Row, read_record, write_record
+from results_page import page
+from results_parts import GIVEN, LEARNED, RESULTS, Part, parts
 
-RESULTS, PAGE = Path("docs/results"), Path("docs/results.md")
-LENGTHS = (2, 3, 4, 5, 7)
-CAPTURES = {"walk": "headset walk", "scenes7": "7-Scenes, registered"}
-DEPTH = {
-    "abs_rel": "Abs Rel",
-    "abs_diff": "Abs, m",
-    "sq_rel": "Sq Rel, m",
-    "rmse": "RMSE, m",
-    "rmse_log": "RMSE log",
-    "delta1": "d<1.25",
-    "delta2": "d<1.25^2",
-    "delta3": "d<1.25^3",
-}
-SHORT = {name: DEPTH[name] for name in ("abs_rel", "abs_diff", "sq_rel", "delta1", "delta2")}
-DETECTORS = {
-    "localisation": "MLE, px",
-    "matching": "MScore",
-    "points": "Num",
-    "repeatability": "Rep",
-    "rotation": "rot@5",
-    "translation": "trans@5cm",
-}
-TABLE_1 = {  # the paper's, on ScanNet
-    "ORB": (2.584, 0.194, 401, 0.613, 0.142, 0.064),
-    "SIFT": (2.327, 0.201, 203, 0.496, 0.311, 0.148),
-    "SURF": (2.577, 0.198, 268, 0.460, 0.303, 0.134),
-    "SuperPoint": (2.545, 0.375, 129, 0.519, 0.489, 0.244),
-    "the paper's network": (3.101, 0.329, 1511, 0.738, 0.518, 0.254),
-}
-TABLE_2 = (0.0932, 0.1540, 0.0506, 0.2505, 0.1426, 0.9287, 0.9767, 0.9893)
-TABLE_4 = (0.1245, 0.2662, 0.0741, 0.3602, 0.1666, 0.8551, 0.9728, 0.9902)
-TABLE_3 = {
-    2: (0.106, 0.173, 0.057),
-    4: (0.090, 0.150, 0.049),
-    5: (0.088, 0.147, 0.048),
-    7: (0.087, 0.144, 0.043),
-}
-CURVES = ("translation", "rotation", "calibration", "blur", "exposure", "views", "depth-range")
+from deltas_nets.evaluate.record import Record, read_record, write_record
+from deltas_nets.outputs.atomic_files import write_json
+
+ROOT = Path(__file__).parents[1]
+PAGE, TIMES = Path("docs/results.md"), RESULTS / "times.json"
+STATE, LOGS = GIVEN / "measured.json", GIVEN / "logs"
+
+
+class State:
+    """Which parts are done, in a file: by name the fingerprint of what decides them."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self.parts: dict[str, Any] = json.loads(STATE.read_text()) if STATE.exists() else {}
+
+    def done(self, part: Part, key: str) -> bool:
+        """Whether the part was measured as it would be now."""
+        known = self.parts.get(part.name, {})
+        return known.get("key") == key and "seconds" in known
+
+    def begun(self, part: Part, key: str) -> bool:
+        """Whether it was stopped while it was measured so."""
+        return bool(self.parts.get(part.name, {}).get("key") == key)
+
+    def note(self, part: Part, **what: Any) -> None:
+        with self._lock:
+            self.parts[part.name] = what
+            write_json(STATE, self.parts)
+            took = {name: one.get("seconds") for name, one in sorted(self.parts.items())}
+            rows = [{"part": name, "seconds": seconds} for name, seconds in took.items()]
+            command = "python benchmarks/results.py measure captures/walk captures/scenes7"
+            write_record(TIMES, Record("times", command=command, rows=rows))
 
 
 def main() -> None:
     """Measure, or write the page."""
-    if sys.argv[1:2] == ["measure"]:
-        for name, capture in zip(CAPTURES, sys.argv[2:4], strict=True):
-            measure_depth(name, Path(capture))
-        measure_pairs()
-        for file in (RESULTS / "depth").glob("*.json"):
-            keep_means(file)
-        measure_inference(Path(sys.argv[2]))
-    PAGE.write_text("\n".join(page()) + "\n", encoding="utf-8")
+    os.chdir(ROOT)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("what", nargs="?", choices=["measure"])
+    parser.add_argument("walk", nargs="?", type=Path)
+    parser.add_argument("scenes7", nargs="?", type=Path)
+    parser.add_argument("--weights", type=Path, help="folder of weights of detectors of others")
+    parser.add_argument("--pairs", type=Path, help="folder with pairs_with_gt.txt and images")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="these parts alone")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
+    parser.add_argument("--list", action="store_true", help="say what would be done")
+    arguments = parser.parse_args()
+    if arguments.what == "measure":
+        given = {name: getattr(arguments, name) for name in ("walk", "scenes7", "weights", "pairs")}
+        link({name: path for name, path in given.items() if path is not None})
+        for name in ("walk", "scenes7"):
+            if not (GIVEN / name / "view_sets.json").exists():
+                sys.exit(f"{GIVEN / name} is no capture with view_sets.json: name WALK and SCENES7")
+        measure(arguments.only, arguments.jobs, only_say=arguments.list)
+    if not arguments.list:
+        PAGE.write_text("\n".join(page()) + "\n", encoding="utf-8")
 
 
-def deltas(*words: object) -> None:
-    """Run a command of deltas; what it prints is seen."""
-    print("deltas", *words, flush=True)
-    program = Path(sys.executable).with_name("deltas")
-    subprocess.run([program, *map(str, words)], check=True)
+def link(given: dict[str, Path]) -> None:
+    """Put what is given where commands name it."""
+    GIVEN.mkdir(exist_ok=True)
+    for name, path in given.items():
+        place = GIVEN / name
+        if place.is_symlink():
+            place.unlink()
+        if not place.exists():
+            place.symlink_to(path.resolve(), target_is_directory=True)
+
+
+def measure(only: Sequence[str] | None, jobs: int, *, only_say: bool) -> None:
+    """Run what was not measured as it would be now."""
+    chosen = [part for part in parts() if only is None or part.name in only]
+    known, code = State(), fingerprint_of_code()
+    keys = {part.name: key_of(part, code) for part in chosen}
+    todo = [part for part in chosen if not known.done(part, keys[part.name])]
+    whole = sum(part.seconds / (1 if part.alone else jobs) for part in todo)
+    print(f"{len(todo)} of {len(chosen)} parts, about {whole / 60:.0f} min of {jobs} free cores")
+    if only_say:
+        for part in todo:
+            print(f"{part.name}: {part.seconds / 60:.1f} min of a core")
+            print(*(f"    {shlex.join(command)}" for command in part.commands), sep="\n")
+        return
+    began, left, failed = time.monotonic(), whole, []
+    by_turn = [(1, [part for part in todo if part.alone]), (jobs, [p for p in todo if not p.alone])]
+    for workers, some in by_turn:
+        with ThreadPoolExecutor(workers) as pool:
+            running = {pool.submit(run, part, keys[part.name], known): part for part in some}
+            try:
+                for finished in as_completed(running):
+                    part, log = running[finished], finished.result()
+                    left -= part.seconds / workers
+                    passed = (time.monotonic() - began) / 60
+                    how = f"failed, see {log}" if log else "done"
+                    failed += [part.name] if log else []
+                    print(f"{part.name}: {how}; {passed:.1f} min, about {left / 60:.0f} more")
+            except KeyboardInterrupt:
+                pool.shutdown(cancel_futures=True)
+                sys.exit("stopped; the same command goes on")
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}; the same command tries them again")
+
+
+def run(part: Part, key: str, known: State) -> Path | None:
+    """Run a part's commands; the file of what they said if one failed."""
+    if not known.begun(part, key):
+        clear(part)
+    known.note(part, key=key)
+    began, log = time.monotonic(), LOGS / f"{part.name.replace(' ', '_')}.txt"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    with log.open("w", encoding="utf-8") as told:
+        for words in part.commands:
+            program = Path(sys.executable)
+            program = program if words[0] == "python" else program.with_name("deltas")
+            command = [str(program), *words[1:]]
+            if subprocess.run(command, env=environment, stdout=told, stderr=told).returncode:
+                return log
+    for words in part.commands:
+        if "evaluate" in words:
+            keep_means(Path(words[-1]))
+    known.note(part, key=key, seconds=round(time.monotonic() - began, 1))
+    for file in part.clears:
+        file.unlink() if file.is_file() else None  # a journal is of no use to anybody else
+    return None
+
+
+def clear(part: Part) -> None:
+    """Remove what a run of something else left behind."""
+    for path in part.clears:
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
 
 
 def keep_means(file: Path) -> None:
@@ -84,182 +175,25 @@ def keep_means(file: Path) -> None:
     write_record(file, replace(record, rows=[r for r in record.rows if r["scene"] == last]))
 
 
-def measure_depth(name: str, capture: Path) -> None:
-    """Tables 2 and 3: each length alone, and maps that have heard each other."""
-    sets = ("--view-sets", capture / "view_sets.json")
-    for views in LENGTHS:
-        file = RESULTS / "depth" / f"{name}-{views}.json"
-        deltas("evaluate", capture, *sets, "--views", views, "--json", file)
-    deltas(
-        *("evaluate", capture, *sets, "--views", 3, "--weights", "plane-sweep"),
-        *("--json", RESULTS / "depth" / f"{name}-plane-sweep.json"),
-    )
-    for views in (3, 7):
-        with tempfile.TemporaryDirectory() as folder:
-            out = ("--format", "npz", "--no-page", "--out", folder)
-            deltas("depth", capture, *sets, "--views", views, *out)
-            file = RESULTS / "depth" / f"{name}-{views}-heard.json"
-            deltas("evaluate", capture, "--predictions", folder, "--json", file)
+def key_of(part: Part, code: str) -> str:
+    """Of what decides a part's figures: commands, code, and what was given."""
+    given = [f"{path.resolve()} {path.stat().st_mtime}" for path in sorted(GIVEN.iterdir())]
+    links = [text for text in given if str(GIVEN.resolve()) not in text]
+    files = [GIVEN / "weights" / file for file in LEARNED.values()]
+    sizes = [f"{file.name} {file.stat().st_size}" for file in files if file.exists()]
+    return hashlib.sha256(repr((part.commands, code, links, sizes)).encode()).hexdigest()[:16]
 
 
-def measure_pairs() -> None:
-    """Table 4, on rooms in its layout."""
-    with tempfile.TemporaryDirectory() as folder:
-        pairs = Path(folder) / "pairs"
-        script = [sys.executable, "benchmarks/room_scenes.py", "demon", str(pairs), "40"]
-        subprocess.run(script, check=True)
-        deltas("evaluate", pairs, "--json", RESULTS / "depth" / "pairs.json")
-
-
-def measure_inference(walk: Path) -> None:
-    """Tables of the supplement, and curves."""
-    sets = ("--view-sets", walk / "view_sets.json", "--sets", 6)
-    for table in PAPER:
-        if table != "offsets":  # deltas-small has none
-            deltas("ablate", table, walk, "--out", RESULTS / "ablations", *sets)
-    for curve in (*CURVES, "order", "units"):
-        of_file = ("--sets", 6) if curve == "views" else sets
-        deltas("robustness", curve, walk, "--out", RESULTS / "robustness", *of_file)
-
-
-def page() -> Iterator[str]:
-    """The lines of docs/results.md."""
-    yield "# Results"
-    yield ""
-    yield "Written by `python benchmarks/results.py` from the records in [results](results), each"
-    yield "of which names its command, data, weights, versions and machine. ScanNet and Sun3D could"
-    yield "not be had: where the paper's figures are theirs, ours stand on other captures, and the"
-    yield "two are no comparison. [evaluation](evaluation.md) says how to measure each on ScanNet."
-    yield from detectors()
-    yield from depth()
-    yield from lengths()
-    yield from pairs()
-    yield from ablations()
-    yield from curves()
-    yield ""
-    yield "## Other methods"
-    yield ""
-    yield "Plane sweep, COLMAP, a cost volume, networks of others: [baselines](baselines.md)."
-
-
-def detectors() -> Iterator[str]:
-    """Table 1."""
-    yield from head("Table 1: detector and descriptor", RESULTS / "detectors.json")
-    columns = list(DETECTORS.values())
-    rows = [(f"{name} (paper, ScanNet)", *figures(values)) for name, values in TABLE_1.items()]
-    for file, count in (("detectors", "all points"), ("detectors_300", "300 points")):
-        record = read_record(RESULTS / f"{file}.json")
-        rows += [
-            (f"{row['detector']}, {count}", *figures(row[key] for key in DETECTORS))
-            for row in record.rows
-        ]
-    yield from table(["", *columns], rows)
-
-
-def depth() -> Iterator[str]:
-    """Table 2."""
-    yield from head("Table 2: three frames", RESULTS / "depth" / "walk-3.json")
-    rows = [("the paper's network (ScanNet)", *figures(TABLE_2))]
-    for name, words in CAPTURES.items():
-        for file, method in (
-            ("3", "deltas-small"),
-            ("3-heard", "deltas-small, maps that hear each other"),
-            ("plane-sweep", "plane sweep"),
-        ):
-            rows.append((f"{method} ({words})", *depth_of(f"{name}-{file}", DEPTH)))
-    yield from table(["", *DEPTH.values()], rows)
-    yield ""
-    yield "Maps that hear each other: `deltas depth` with its usual passes, then `deltas evaluate"
-    yield "--predictions`."
-
-
-def lengths() -> Iterator[str]:
-    """Table 3."""
-    yield from head("Table 3: more frames", RESULTS / "depth" / "walk-7.json")
-    three = ("abs_rel", "abs_diff", "sq_rel")
-    rows = [
-        (f"{count}: the paper's network (ScanNet)", *figures(values))
-        for count, values in TABLE_3.items()
-    ]
-    for name, words in CAPTURES.items():
-        for count in LENGTHS:
-            rows.append((f"{count}: {words}", *depth_of(f"{name}-{count}", three)))
-        rows.append((f"7, heard: {words}", *depth_of(f"{name}-7-heard", three)))
-    yield from table(["frames", *(DEPTH[key] for key in three)], rows)
-
-
-def pairs() -> Iterator[str]:
-    """Table 4."""
-    yield from head("Table 4: pairs as DPSNet prepared them", RESULTS / "depth" / "pairs.json")
-    rows = [("the paper's network (Sun3D)", *figures(TABLE_4))]
-    rows.append(("deltas-small (procedural rooms)", *depth_of("pairs", DEPTH)))
-    yield from table(["", *DEPTH.values()], rows)
-
-
-def ablations() -> Iterator[str]:
-    """The tables of the supplement."""
-    for name, paper in PAPER.items():
-        file = RESULTS / "ablations" / f"{name}.json"
-        if not file.exists():
-            yield from ["", f"## Supplement: {name}", ""]
-            yield "`deltas-small` lacks the setting, and the paper's weights could not be had."
-            yield f"`deltas ablate {name} CAPTURE --out DIR --weights FILE` measures it."
-        else:
-            yield from head(f"Supplement: {name}", file)
-        rows = [
-            (f"{row.step} (paper, ScanNet)", *figures(getattr(row, key) for key in SHORT))
-            for row in paper
-        ]
-        if file.exists():
-            rows += [
-                (f"{row['step']} ({row['weights']})", *figures(row.get(key) for key in SHORT))
-                for row in read_record(file).rows
-            ]
-        yield ""
-        yield from table(["", *SHORT.values()], rows)
-
-
-def curves() -> Iterator[str]:
-    """What disturbs."""
-    for name in CURVES:
-        file = RESULTS / "robustness" / f"{name}.json"
-        yield from head(f"Robustness: {name}", file)
-        yield f"![{name}](results/robustness/{name}.png)"
-        yield ""
-        rows = [
-            (str(row["step"]), *figures(row.get(key) for key in ("abs_rel", "delta1")))
-            for row in read_record(file).rows
-        ]
-        yield from table(["", "Abs Rel", "d<1.25"], rows)
-
-
-def head(title: str, file: Path) -> list[str]:
-    """A heading and how it was measured."""
-    record: Record = read_record(file)
-    return ["", f"## {title}", "", f"`{record.command}`", ""]
-
-
-def depth_of(name: str, keys: Sequence[str] | dict[str, str]) -> list[str]:
-    """Figures of a record of `deltas evaluate`: means over the dense maps of all its scenes."""
-    rows = read_record(RESULTS / "depth" / f"{name}.json").rows
-    row: Row = [row for row in rows if row["scores"] == "dense"][-1]
-    return figures(row.get(key) for key in keys)
-
-
-def figures(values: object) -> list[str]:
-    """Numbers with three digits after the point."""
-    return [
-        "-" if value is None else str(value) if isinstance(value, int) else f"{value:.3f}"
-        for value in values  # type: ignore[attr-defined]
-    ]
-
-
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Markdown."""
-    yield "| " + " | ".join(columns) + " |"
-    yield "|" + "|".join(["--", *["--:"] * (len(columns) - 1)]) + "|"
-    for row in rows:
-        yield "| " + " | ".join(row) + " |"
+def fingerprint_of_code() -> str:
+    """Of both packages, weights included, and of what makes rooms and tables here."""
+    digest = hashlib.sha256()
+    folders = ("deltas_geom", "deltas_nets")
+    files = [file for folder in folders for file in Path(folder).rglob("*") if file.is_file()]
+    files += [Path("benchmarks") / f"{n}.py" for n in ("baselines", "room_scenes")]
+    for file in sorted(files):
+        if "__pycache__" not in file.parts:
+            digest.update(f"{file}".encode() + file.read_bytes())
+    return digest.hexdigest()
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def main() -> None:
 
 def as_scannet(folder: Path, room: PosedImages) -> None:
     for name in ("color", "depth", "pose", "intrinsic"):
-        (folder / name).mkdir(parents=True)
+        (folder / name).mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", room.views.K[0].numpy(), fmt="%.6f")
     world_from_cam = torch.linalg.inv(room.views.cam_from_world.double())
     for i in range(len(room.images)):
@@ -48,7 +48,7 @@ def as_scannet(folder: Path, room: PosedImages) -> None:
 
 
 def as_pair(folder: Path, room: PosedImages) -> None:
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "cam.txt", room.views.K[0].numpy())
     np.savetxt(folder / "poses.txt", room.views.cam_from_world[:, :3].reshape(2, 12).numpy())
     for i in range(2):

@@ -1,5 +1,6 @@
 """Which scenes are scored: captures, folders of captures, and lists of them in files."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -89,10 +90,12 @@ def _lines(file: Path) -> list[str]:
 
 def _by_name(scenes: Sequence[Path]) -> dict[str, Path]:
     """Paths by the shortest ends of them that differ, so that names fit into tables."""
-    whole = [scene.resolve() for scene in scenes]
-    if len(set(whole)) < len(whole):
-        twice = next(scene for scene in whole if whole.count(scene) > 1)
+    places = [scene.resolve() for scene in scenes]
+    if len(set(places)) < len(places):
+        twice = next(scene for scene in places if places.count(scene) > 1)
         raise UserError("a scene is named twice", twice, "name it once")
+    # Links keep their names, which are those of the command line.
+    whole = [Path(os.path.abspath(scene)) for scene in scenes]
     longest = max((len(scene.parts) for scene in whole), default=1)
     for parts in range(1, longest + 1):
         names = ["/".join(scene.parts[-parts:]) for scene in whole]

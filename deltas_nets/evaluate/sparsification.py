@@ -32,8 +32,9 @@ def ause(
     Returns:
         NaN where no pixel counts, or none is wrong.
 
-    Source: Ilg et al., Uncertainty estimates and multi-hypotheses networks for optical flow (2018),
-    section 4.2, with the relative error as Schroeppel et al. (2022) take it.
+    Source: after Ilg et al., Uncertainty estimates and multi-hypotheses networks for optical flow
+    (2018), with the relative error as Schroeppel et al. (2022) take it. Steps, what ends the curves
+    and what they are divided by are ours by definition (docs/evaluation.md).
 
     Example:
         >>> truth = np.full(200, 2.0)

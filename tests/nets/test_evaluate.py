@@ -13,6 +13,7 @@ from run_command import Result, Run, assert_one_line
 from small_capture import write_capture
 
 from deltas_nets.commands.evaluate import Evaluate
+from deltas_nets.errors import UserError
 from deltas_nets.evaluate.record import read_record
 from deltas_nets.evaluate.room_scores import room_in_files
 from deltas_nets.evaluate.scenes import named_scenes, scenes_in
@@ -292,6 +293,16 @@ def test_what_the_supplement_varies_is_a_flag(
     refused = run("evaluate", capture, "--offset", 2)
     assert_one_line(refused, "deltas-small has no such setting, --offset")
     assert_one_line(run("evaluate", capture, "--num-points", 3), "num_points must be 0")
+
+
+def test_a_scene_is_called_as_it_was_named_also_through_a_link(
+    two_scenes: Path, tmp_path: Path
+) -> None:
+    link = tmp_path / "walk"
+    link.symlink_to(two_scenes / "a", target_is_directory=True)
+    assert list(named_scenes([link])) == ["walk"]
+    with pytest.raises(UserError, match="a scene is named twice"):
+        named_scenes([link, two_scenes / "a"])
 
 
 def test_contradictions_are_refused_in_one_line(two_scenes: Path, run: Run, tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def test_a_journal_gives_back_what_was_written_whatever_was_torn(
     assert "half" not in kept
 
 
-def test_keys_differ_where_figures_may(capture: Capture) -> None:
+def test_keys_differ_where_figures_may(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     views = ViewSet("1", ("0", "2"))
     base = measuring.Measurement(capture, (views,), PredictConfig())
     series, step = TABLES["points"], TABLES["points"].steps[1]
@@ -183,7 +183,9 @@ def test_keys_differ_where_figures_may(capture: Capture) -> None:
         base.key(series, TABLES["points"].steps[2], {"sha256": "a"}),
     }
     keys.add(base.key(TABLES["ratio"], step, {"sha256": "a"}))
-    assert len(keys) == 7 and key_of({"a": 1}) != key_of({"a": 2})
+    monkeypatch.setattr(measuring, "__version__", "of another day")
+    keys.add(base.key(series, step, {"sha256": "a"}))
+    assert len(keys) == 8 and key_of({"a": 1}) != key_of({"a": 2})
 
 
 def test_a_table_that_was_stopped_goes_on_and_measures_nothing_twice(

@@ -1,8 +1,9 @@
 """Key frames and measurement frames of DeepVideoMVS: an online system that looks back only.
 
-Source: Duzceker et al., DeepVideoMVS: Multi-view stereo on video with recurrent spatio-temporal
-fusion (CVPR 2021), section 4 and its supplement; the distance is that of Hou et al., Multi-view
-stereo by temporal nonparametric fusion (ICCV 2019).
+Source: after Duzceker et al., DeepVideoMVS: Multi-view stereo on video with recurrent
+spatio-temporal fusion (CVPR 2021), and Hou et al., Multi-view stereo by temporal nonparametric
+fusion (ICCV 2019), whose distance it is. The rule as it stands here was not compared with their
+program.
 """
 
 from collections import deque
