@@ -13,11 +13,10 @@ import numpy as np
 from deltas_nets.ablations.changes import FrameChange
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.predict.depth_map import DepthMap, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
 from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
@@ -52,14 +51,10 @@ class Disturbed:
         """As the network."""
         self.inner.check_asked(config, capture, view_sets)
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from what was made of all."""
-        return self.inner.depth_map([self.change(frame) for frame in frames], config, measured)
+        changed = [self.change(frame) for frame in wanted.frames]
+        return self.inner.depth_map(wanted._replace(frames=changed))
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """As the network."""
@@ -93,18 +88,13 @@ class InUnit(Disturbed):
         """The network of other settings, in the same unit."""
         return InUnit(self.inner.varied(settings), self.factor, told=self.told)
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame in metres again."""
-        near, far = (self.factor * depth for depth in config.depth_range)
+        near, far = (self.factor * depth for depth in wanted.config.depth_range)
         unit = 1 / self.factor if self.told else 1.0
-        scaled = [self.change(frame) for frame in frames]
-        in_units = replace(config, depth_range=(near, far))
-        found = look(self.inner, scaled, in_units, Reach(near, far, unit), measured)
+        scaled = [self.change(frame) for frame in wanted.frames]
+        in_units = replace(wanted.config, depth_range=(near, far))
+        found = look(self.inner, scaled, in_units, Reach(near, far, unit), wanted.measured)
         keypoints = found.keypoints._replace(depth=found.keypoints.depth / self.factor)
         depth = (found.depth / self.factor).astype(np.float32)
         return found._replace(depth=depth, keypoints=keypoints)

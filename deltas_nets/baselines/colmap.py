@@ -1,7 +1,5 @@
 """COLMAP's sparse points as depth maps: interpolated, and through our densifier."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -10,9 +8,7 @@ from deltas_geom.cameras.pixels import resize_pixels
 from deltas_nets.baselines.colmap_points import colmap, sparse_points
 from deltas_nets.baselines.densified import densified, densifier_record
 from deltas_nets.baselines.named import Named
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
-from deltas_nets.predict.depth_map import DepthMap, PredictConfig, point_cloud
+from deltas_nets.predict.depth_map import DepthMap, Wanted, point_cloud
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import work_size_of
 from deltas_nets.weights_file import load_model
@@ -33,20 +29,14 @@ class SparseInterpolated(Named):
     def __init__(self, device: str | torch.device = "cpu") -> None:
         colmap()
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them; 0 everywhere where COLMAP finds no point."""
-        self.refuse_measured(frames, measured)
-        anchor = frames[0]
-        found = sparse_points(frames, config.depth_range)
-        size = config.size or anchor.image_size
+        self.refuse_measured(wanted)
+        found, size = sparse_points(wanted.frames, wanted.config.depth_range), wanted.size
         pixels = resize_pixels(found.pixels, old_size=found.image_size, new_size=size)
         depth = interpolated(pixels.double().numpy(), found.depth.double().numpy(), size)
-        points, colors = point_cloud(anchor, depth, size, work_size_of(anchor, config))
+        work_size = work_size_of(wanted.anchor, wanted.config)
+        points, colors = point_cloud(wanted.anchor, depth, size, work_size)
         return DepthMap(depth, None, points, colors, found)
 
 
@@ -66,15 +56,11 @@ class SparseDensified(Named):
         colmap()
         self.encode = EncodedFrames(load_model(device=device))
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame; the others give points."""
-        self.refuse_measured(frames, measured)
-        return densified(self.encode, frames, config, sparse_points(frames, config.depth_range))
+        self.refuse_measured(wanted)
+        found = sparse_points(wanted.frames, wanted.config.depth_range)
+        return densified(self.encode, wanted, found)
 
     def weights_record(self, name_or_file: str) -> dict[str, str]:
         """Of the densifier."""

@@ -1,14 +1,11 @@
 """Points from elsewhere through the densifier of `deltas-small`: what its own points are worth."""
 
-from collections.abc import Sequence
-
 import torch
 
 from deltas_geom import rasterize_depth
 from deltas_geom.cameras.pixels import resize_pixels
-from deltas_nets.captures.frame import Frame
 from deltas_nets.network.known_depth import KnownDepth
-from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
+from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, Wanted, finished_map
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import work_size_of
 from deltas_nets.weights_file import weights_record
@@ -27,21 +24,18 @@ def densifier_record(name: str) -> dict[str, str]:
 
 
 @torch.inference_mode()
-def densified(
-    encode: EncodedFrames, frames: Sequence[Frame], config: PredictConfig, points: KeypointDepths
-) -> DepthMap:
+def densified(encode: EncodedFrames, wanted: Wanted, points: KeypointDepths) -> DepthMap:
     """The map of the anchor that rests on points alone, each of full weight.
 
     Args:
         encode: of a trained network.
-        frames: the anchor and its sources, which are not looked at.
-        config: sizes.
+        wanted: the anchor and its sources, which are not looked at.
         points: any number of them, at any size.
 
     Raises:
         UserError: an image cannot be read.
     """
-    anchor = frames[0]
+    anchor, config = wanted.anchor, wanted.config
     work_size = work_size_of(anchor, config)
     _, encoded = encode([anchor], work_size=work_size)
     device = next(encode.model.parameters()).device
@@ -53,6 +47,6 @@ def densified(
         mask=points.depth[None].to(device) > 0,
         reduce="mean",
     )
-    found = encode.model.densified(encoded, sparse, num_views=len(frames))
+    found = encode.model.densified(encoded, sparse, num_views=len(wanted.frames))
     work = KnownDepth(found.depth[0], (found.std / found.depth)[0])
     return finished_map(anchor, work, points, config)._replace(confidence=None, log_std=None)

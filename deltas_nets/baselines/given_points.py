@@ -10,10 +10,10 @@ from deltas_nets.baselines.densified import densified, densifier_record
 from deltas_nets.baselines.named import Named
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth, OfSensor
+from deltas_nets.captures.measured import OfSensor
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.errors import UserError
-from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, Wanted
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import DeltasPredictor, work_size_of
 from deltas_nets.weights_file import load_model
@@ -56,17 +56,11 @@ class TruePoints(Named):
         return densifier_record(name_or_file)
 
     @torch.inference_mode()
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame; the others only tell in which unit it is seen."""
-        self.refuse_measured(frames, measured)
+        self.refuse_measured(wanted)
         assert self._capture is not None, "check_asked comes first"
-        anchor = frames[0]
-        work_size = work_size_of(anchor, config)
+        anchor, work_size = wanted.anchor, work_size_of(wanted.anchor, wanted.config)
         position = list(self._capture.frames).index(anchor.id)
         true = OfSensor(self._capture, deviation=0.0)(position)
         assert true is not None  # checked
@@ -78,9 +72,9 @@ class TruePoints(Named):
         seen = torch.from_numpy(true.pixels)
         seen = resize_pixels(seen, old_size=anchor.image_size, new_size=work_size)
         depth = _nearest(pixels.double(), seen, torch.from_numpy(true.depth))
-        depth = depth * _unit(frames, self._capture)
+        depth = depth * _unit(wanted.frames, self._capture)
         points = KeypointDepths(pixels.float(), depth.float(), work_size)
-        return densified(self.encode, frames, config, points)
+        return densified(self.encode, wanted, points)
 
 
 class NoPoints(DeltasPredictor):

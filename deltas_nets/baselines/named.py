@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.varied import NetworkSettings
-from deltas_nets.predict.depth_map import DepthMap, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
 from deltas_nets.predict.views_alone import ViewsAlone
 
 
@@ -39,12 +37,7 @@ class Named(ViewsAlone):
         settings.check_known(self.name)
         return self
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them."""
         raise NotImplementedError
 

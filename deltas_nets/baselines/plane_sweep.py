@@ -1,6 +1,5 @@
 """Plane sweep and semi-global matching as a predictor: what depth costs without learning."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -14,13 +13,11 @@ from deltas_nets.baselines.sweep.semi_global import Penalties, aggregate
 from deltas_nets.baselines.sweep.similarity import similarity_volume
 from deltas_nets.baselines.sweep.smoothing import Smoothing, filled
 from deltas_nets.baselines.sweep.winner import winner
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.work_size import load_views
 from deltas_nets.predict.depth_map import (
     DepthMap,
     KeypointDepths,
-    PredictConfig,
+    Wanted,
     point_cloud,
     resized,
 )
@@ -78,24 +75,17 @@ class PlaneSweep(Named):
         self.config = config or SweepConfig()
 
     @torch.inference_mode()
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them; the points are the pixels it believes."""
-        self.refuse_measured(frames, measured)
-        anchor = frames[0]
-        work_size = config.work_size or size_of_sweep(anchor.image_size)
-        images, views = load_views(frames, work_size=work_size)
+        self.refuse_measured(wanted)
+        work_size = wanted.config.work_size or size_of_sweep(wanted.anchor.image_size)
+        images, views = load_views(wanted.frames, work_size=work_size)
         found = plane_sweep(
-            images.to(self.device), views.to(self.device), config.depth_range, self.config
+            images.to(self.device), views.to(self.device), wanted.config.depth_range, self.config
         )
-        size = config.size or anchor.image_size
         # Linear in inverse depth, as planes are.
-        depth = np.reciprocal(resized(1 / found.depth[None], size))
-        points, colors = point_cloud(anchor, depth, size, work_size)
+        depth = np.reciprocal(resized(1 / found.depth[None], wanted.size))
+        points, colors = point_cloud(wanted.anchor, depth, wanted.size, work_size)
         keypoints = KeypointDepths.of((found.depth * found.believed)[None])
         return DepthMap(depth, None, points, colors, keypoints)
 

@@ -6,8 +6,7 @@ from typing import Any
 import torch
 
 from deltas_geom import PosedViews
-from deltas_nets.captures.capture import Capture, Frame
-from deltas_nets.captures.measured import MeasuredDepth
+from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import load_views
 from deltas_nets.config import to_dict
@@ -17,6 +16,7 @@ from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import (
     DepthMap,
     PredictConfig,
+    Wanted,
     finished_map,
     keypoint_depths,
 )
@@ -53,20 +53,16 @@ class DensePredictor(ViewsAlone):
         return self
 
     @torch.inference_mode()
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them; it takes no measured depth."""
-        self.refuse_measured(frames, measured)
+        self.refuse_measured(wanted)
+        config, work_size = wanted.config, work_size_of(wanted.anchor, wanted.config)
         device = next(self.model.parameters()).device
-        images, views = load_views(frames, work_size=work_size_of(frames[0], config))
+        images, views = load_views(wanted.frames, work_size=work_size)
         of_device = PosedViews(*(part.to(device) for part in views))
         found = self.model(images.to(device), of_device, config.depth_range)
         work = KnownDepth(found.depth, found.std / found.depth)
-        return finished_map(frames[0], work, keypoint_depths(found), config)
+        return finished_map(wanted.anchor, work, keypoint_depths(found), config)
 
     def network_record(self) -> dict[str, Any]:
         """Its config."""

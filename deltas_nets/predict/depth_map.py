@@ -1,5 +1,6 @@
 """What is asked of a depth map, and what comes out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from deltas_geom import PosedViews, unproject
 from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.prediction import DepthPrediction
@@ -39,6 +41,30 @@ class PredictConfig:
                 raise ValueError(f"{name} must be HEIGHT WIDTH of 32 or more, got {size}")
         if not 0 <= self.min_confidence <= 1:
             raise ValueError(f"--min-confidence must be within 0 to 1, got {self.min_confidence}")
+
+
+class Wanted(NamedTuple):
+    """A depth map that a network is asked for.
+
+    Attributes:
+        frames: the anchor, whose depth is wanted, and its sources.
+        config: sizes, range, confidence.
+        measured: depth of the anchor that is known; without sources the map rests on it alone.
+    """
+
+    frames: Sequence[Frame]
+    config: PredictConfig
+    measured: MeasuredDepth | None = None
+
+    @property
+    def anchor(self) -> Frame:
+        """The frame whose depth is wanted."""
+        return self.frames[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the map."""
+        return self.config.size or self.anchor.image_size
 
 
 class KeypointDepths(NamedTuple):

@@ -9,7 +9,7 @@ import torch
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
-from deltas_nets.predict.depth_map import DepthMap, PredictConfig, resized
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted, resized
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
 
@@ -41,7 +41,7 @@ def look(
     if measured is not None:
         measured = measured._replace(depth=measured.depth * unit)
     of_straight = replace(config, size=None) if isinstance(seen[0], StraightFrame) else config
-    found = predictor.depth_map(seen, of_straight, measured)
+    found = predictor.depth_map(Wanted(seen, of_straight, measured))
     found = found if unit == 1 else _in_units_of_capture(found, unit)
     return as_photographed(found, seen[0], config)
 

@@ -23,6 +23,7 @@ from deltas_nets.predict.depth_map import (
     DepthMap,
     KeypointDepths,
     PredictConfig,
+    Wanted,
     finished_map,
     keypoint_depths,
 )
@@ -82,13 +83,9 @@ class DeltasPredictor:
     ) -> None:
         """It can do all of it."""
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them, and from what was measured."""
+        frames, config, measured = wanted
         if len(frames) == 1 or (self.without_points and measured is not None):
             return complete_frame(self.encode, frames[0], config, measured)
         if self.without_points:

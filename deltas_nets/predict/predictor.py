@@ -8,8 +8,6 @@ import torch
 
 from deltas_nets import reference
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.baselines import BASELINES
 from deltas_nets.config.lookup import look_up
@@ -17,7 +15,7 @@ from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.predict.dense import DensePredictor
-from deltas_nets.predict.depth_map import DepthMap, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.reference import ReferencePredictor
 from deltas_nets.weights_file import load_network, weights_file
@@ -46,18 +44,11 @@ class Predictor(Protocol):
             UserError: names what it cannot.
         """
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them; frames seen before need not be encoded again.
 
         Args:
-            frames: the anchor and its sources.
-            config: sizes, range, confidence; asked for what it can do (:meth:`check_asked`).
-            measured: depth of the anchor that is known; without sources the map rests on it alone.
+            wanted: frames, and a config that asks for what it can do (:meth:`check_asked`).
 
         Raises:
             UserError: an image cannot be read; the network does not take measured depth, or there

@@ -17,7 +17,6 @@ from torch import Tensor
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_geom.cameras.poses import relative_pose
 from deltas_nets.captures.capture import Capture, Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import SMALLEST_BASELINE
 from deltas_nets.config.varied import NetworkSettings
@@ -27,6 +26,7 @@ from deltas_nets.predict.depth_map import (
     DepthMap,
     KeypointDepths,
     PredictConfig,
+    Wanted,
     frames_of,
     point_cloud,
     resized,
@@ -110,19 +110,15 @@ class ReferencePredictor(ViewsAlone):
         for views in view_sets:
             check_cameras(frames_of(capture, views), work_size=work_size)
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them; it takes no measured depth."""
-        self.refuse_measured(frames, measured)
-        work_size = config.work_size or WORK_SIZE
-        found = predict_reference(self.network, frames, work_size=work_size, settings=self.settings)
-        size = config.size or frames[0].image_size
+        self.refuse_measured(wanted)
+        work_size, size = wanted.config.work_size or WORK_SIZE, wanted.size
+        found = predict_reference(
+            self.network, wanted.frames, work_size=work_size, settings=self.settings
+        )
         depth = np.maximum(resized(found.depth, size), 0)  # below 0 it is no depth
-        points, colors = point_cloud(frames[0], depth, size, work_size)
+        points, colors = point_cloud(wanted.anchor, depth, size, work_size)
         keypoints = KeypointDepths(found.pixels, found.point_depth, work_size)
         return DepthMap(depth, None, points, colors, keypoints)
 

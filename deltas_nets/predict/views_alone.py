@@ -1,14 +1,11 @@
 """What networks and baselines have in common that take views and nothing else, and have no stages
 of a network of deltas."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.depth_map import PredictConfig, Wanted
 
 __all__ = ["ViewsAlone"]
 
@@ -21,13 +18,13 @@ class ViewsAlone:
         """As refusals call it."""
         raise NotImplementedError
 
-    def refuse_measured(self, frames: Sequence[Frame], measured: MeasuredDepth | None) -> None:
+    def refuse_measured(self, wanted: Wanted) -> None:
         """Refuse what only a network of deltas can use.
 
         Raises:
             UserError: there is measured depth, or no source.
         """
-        if measured is not None or len(frames) == 1:
+        if wanted.measured is not None or len(wanted.frames) == 1:
             what = f"{self.called} takes no measured depth, and looks at two views or more"
             raise UserError(what, "--sensor-depth", "leave it out")
 

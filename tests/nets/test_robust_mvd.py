@@ -11,7 +11,7 @@ from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.evaluate.depth_metrics import depth_metrics
 from deltas_nets.evaluate.robust_mvd import RobustMvdModel, robust_mvd_metrics
-from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.depth_map import PredictConfig, Wanted
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.predictor import load_predictor
 from deltas_nets.predict.search import Followed
@@ -52,7 +52,7 @@ def test_the_map_is_that_of_the_capture(model: RobustMvdModel, sample: Capture) 
     assert isinstance(network, DeltasPredictor)
     # The same frames, from files.
     frames = list(sample.frames.values())
-    expected = network.depth_map(frames, PredictConfig())
+    expected = network.depth_map(Wanted(frames, PredictConfig()))
     assert pred["depth"].shape == pred["depth_uncertainty"].shape == (1, 1, 96, 128)
     assert (pred["depth_uncertainty"] > 0).all()
     assert aux == {}

@@ -1,7 +1,6 @@
 """Rooms are scored by whatever makes depth: networks, settings and baselines."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,10 @@ import torch
 from run_command import Run, assert_one_line
 
 from deltas_geom import PosedViews, project
-from deltas_nets.captures.frame import Frame
-from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.room_scores import room_in_files, score_rooms
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS, held_out_rooms, predict_room
-from deltas_nets.predict.depth_map import DepthMap, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.rooms import render_room
 from deltas_nets.weights_file import load_model
@@ -88,16 +85,11 @@ class Failing(DeltasPredictor):
 
     rooms: tuple[str, ...] = ()
 
-    def depth_map(
-        self,
-        frames: Sequence[Frame],
-        config: PredictConfig,
-        measured: MeasuredDepth | None = None,
-    ) -> DepthMap:
-        folder = frames[0].image_path.parent.parent
-        if folder.name in self.rooms:
-            raise UserError("no map", frames[0].image_path, "try another")
-        return super().depth_map(frames, config, measured)
+    def depth_map(self, wanted: Wanted) -> DepthMap:
+        file = wanted.anchor.image_path
+        if file.parent.parent.name in self.rooms:
+            raise UserError("no map", file, "try another")
+        return super().depth_map(wanted)
 
 
 def test_a_room_that_fails_is_named_by_its_number() -> None:

@@ -1,6 +1,5 @@
 """What is searched follows from the capture, in any unit; an oracle stands for the network."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from deltas_nets.captures.working_depth import (
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.verdict import verdict
 from deltas_nets.predict import search
-from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, Wanted
 from deltas_nets.predict.first_look import depth_seen, scale_by_measurements, scale_by_sensor
 from deltas_nets.predict.look import look
 from deltas_nets.predict.reach import ROOM, Reach, end_of_pile, reach_of
@@ -45,9 +44,8 @@ class Oracle:
         self.wall = wall
         self.asked: list[tuple[float, float]] = []
 
-    def depth_map(
-        self, frames: Sequence[Frame], config: PredictConfig, measured: object = None
-    ) -> DepthMap:
+    def depth_map(self, wanted: Wanted) -> DepthMap:
+        frames, config, _ = wanted
         self.asked.append(config.depth_range)
         baseline = np.linalg.norm((frames[1].cam_from_world - frames[0].cam_from_world)[:3, 3])
         depth = float(np.clip(self.wall * baseline / 0.15, *config.depth_range))
@@ -61,10 +59,8 @@ class Oracle:
 class Blind(Oracle):
     """Finds points and writes no map."""
 
-    def depth_map(
-        self, frames: Sequence[Frame], config: PredictConfig, measured: object = None
-    ) -> DepthMap:
-        found = super().depth_map(frames, config)
+    def depth_map(self, wanted: Wanted) -> DepthMap:
+        found = super().depth_map(wanted)
         return found._replace(depth=np.zeros_like(found.depth))
 
 

@@ -32,7 +32,7 @@ from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.evaluate.record import read_record
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.depth_map import PredictConfig, Wanted
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.weights_file import save_weights
 
@@ -61,7 +61,7 @@ def weights(model: Deltas, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def depth_of(predictor: DeltasPredictor | Disturbed, frames: list[Frame]) -> np.ndarray:
-    return predictor.depth_map(frames, PredictConfig(work_size=(48, 64))).depth
+    return predictor.depth_map(Wanted(frames, PredictConfig(work_size=(48, 64)))).depth
 
 
 def all_frames(capture: Capture) -> list[Frame]:

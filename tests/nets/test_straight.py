@@ -13,7 +13,7 @@ from deltas_geom.cameras.pixels import pixel_grid
 from deltas_nets.captures.frame import Frame, Lens
 from deltas_nets.captures.images import Span
 from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
-from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig
+from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, Wanted
 from deltas_nets.predict.look import look
 from deltas_nets.predict.reach import Reach
 
@@ -96,11 +96,9 @@ def test_maps_of_straight_images_lie_on_the_photo(name: str, tmp_path: Path) -> 
 class Sees:
     """Depth that follows from the pixel's ray alone: a wall that is slanted."""
 
-    def depth_map(
-        self, frames: list[Frame], config: PredictConfig, measured: object = None
-    ) -> DepthMap:
-        frame = frames[0]
-        assert frame.lens is None and config.size is None
+    def depth_map(self, wanted: Wanted) -> DepthMap:
+        frame = wanted.anchor
+        assert frame.lens is None and wanted.config.size is None
         grid = pixel_grid(frame.image_size, dtype=torch.float64)
         x, y = ((grid.numpy() - frame.K[:2, 2]) / np.diag(frame.K)[:2]).T
         depth = (2 / (1 + 0.15 * x + 0.1 * y)).reshape(frame.image_size).astype(np.float32)

@@ -15,7 +15,7 @@ from deltas_nets.config import CONFIGS, NetworkConfig
 from deltas_nets.config.varied import NetworkSettings, varied_config
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.depth_map import PredictConfig, Wanted
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.predictor import Predictor, load_predictor
 from deltas_nets.predict.reference import ReferencePredictor
@@ -51,7 +51,7 @@ def light() -> DeltasPredictor:
 def shown(predictor: Predictor, capture: Capture, **settings: Any) -> list[np.ndarray[Any, Any]]:
     """Depth, key points and their depth, of two frames."""
     frames = [capture.frame(0), capture.frame(1)]
-    found = predictor.varied(NetworkSettings(**settings)).depth_map(frames, WORK)
+    found = predictor.varied(NetworkSettings(**settings)).depth_map(Wanted(frames, WORK))
     points = found.keypoints
     return [found.depth, points.pixels.cpu().numpy(), points.depth.cpu().numpy()]
 
@@ -109,7 +109,8 @@ def test_maps_rest_on_as_many_points_as_asked(
 def test_without_points_the_sources_do_not_matter(capture: Capture, light: DeltasPredictor) -> None:
     alone = light.varied(NetworkSettings(num_points=0))
     one, other = (
-        alone.depth_map([capture.frame(0), capture.frame(source)], WORK).depth for source in (1, 2)
+        alone.depth_map(Wanted([capture.frame(0), capture.frame(source)], WORK)).depth
+        for source in (1, 2)
     )
     assert np.array_equal(one, other)
     assert alone.network_record()["without_points"]
