@@ -267,6 +267,8 @@ def finite_views(
 ) -> tuple[tuple[Tensor, Tensor], Tensor | None, torch.Size]:
     """Cameras to compute with: an identity, without gradient, in place of what is not finite.
 
+    Nor is a camera whose numbers are so large that a product of four has none.
+
     Returns:
         K and poses, which were finite ``(*B, V, 1, 1)`` bool or None if all, and ``*B``.
 
@@ -278,7 +280,9 @@ def finite_views(
         kind = type(views).__name__
         raise TypeError(f"views must be PosedViews, got {kind}: use PosedViews(K, cam_from_world)")
     batch = views.check_shapes()
-    (K, known), (poses, posed) = finite_intrinsics(views.K), finite_or_zero(views[1], dims=2)
+    poses = views.cam_from_world
+    poses, posed = finite_or_zero(poses, dims=2, limit=torch.finfo(poses.dtype).max ** 0.25)
+    K, known = finite_intrinsics(views.K)
     return (K, poses), both(known, posed), batch
 
 
@@ -287,8 +291,8 @@ def finite_intrinsics(K: Tensor) -> tuple[Tensor, Tensor | None]:
     plain = K.detach()
     focal, most = plain.diagonal(dim1=-2, dim2=-1), torch.finfo(K.dtype).max ** 0.25
     # Then the product of two is not 0, either.
-    if surely_below(plain) and surely_below(focal.reciprocal(), most):
+    if surely_below(plain, most) and surely_below(focal.reciprocal(), most):
         return K, None
-    known = (plain.abs().amax(dim=(-2, -1)) < torch.inf) & (focal[..., 0] * focal[..., 1] != 0)
+    known = (plain.abs().amax(dim=(-2, -1)) < most) & (focal[..., 0] * focal[..., 1] != 0)
     known = known[..., None, None]
     return torch.where(known, K, torch.eye(3, device=K.device, dtype=K.dtype)), known

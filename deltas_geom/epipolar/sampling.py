@@ -14,10 +14,12 @@ from deltas_geom.checks import batch_shape, check_batch, check_image_size, check
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
+    both,
     finite_or_zero,
     numbers_or_zero,
     only,
     promoted,
+    unless_all,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -57,7 +59,8 @@ def sample_segments(
         image_size: (height, width); when given, offset samples outside are masked out.
 
     Returns:
-        Samples. Those of a segment that is not visible, or not finite, are masked.
+        Samples. Those of a segment that is not visible, not finite, or without a foreshortening
+        above 0, are masked.
 
     Source: the paper, section 3.2.
     """
@@ -80,6 +83,9 @@ def sample_segments(
         torch.linspace(end, 1 - end, num_samples, device=start.device, dtype=start.dtype)
         for end in (0, 1)
     )
+    # At 0 an end is in the camera's plane, and pixels on the way are quotients of zeros.
+    ahead = unless_all(ratio[..., 0] > torch.finfo(ratio.dtype).tiny ** 0.25)
+    sound = both(sound, None if ahead is None else ahead.unsqueeze(-1))
     # Homogeneous interpolation: with r the foreshortening, a share s of the inverse depth
     # lies at the share s r / (1 - s + s r) of the pixels.
     ratio = only(ratio, sound, other=1.0)

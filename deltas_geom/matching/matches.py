@@ -16,7 +16,6 @@ from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
     only,
-    surely_below,
     unless_all,
     without_autocast,
 )
@@ -95,7 +94,8 @@ def soft_argmax(
     check_bool(mask=mask)
     if window is not None and window < 0:
         raise ValueError(f"window must not be negative, got {window}")
-    positions, known = finite_or_zero(positions)
+    # Beyond, squares of what is not possible count.
+    positions, known = finite_or_zero(positions, limit=torch.finfo(positions.dtype).max ** 0.25)
     logits, finite = finite_or_zero(logits.expand(*batch, -1), dims=0)
     possible = both(both(mask, finite), None if known is None else known[..., 0])
     lowest = torch.finfo(logits.dtype).min / 4
@@ -108,9 +108,6 @@ def soft_argmax(
         near = torch.where((index - place[..., None]).abs() <= window, probability, 0.0)
     mass = near.sum(dim=-1)
     share = safe_divide(near, mass[..., None], (mass > 0)[..., None])
-    far = torch.finfo(positions.dtype).max ** 0.25  # beyond, squares of what is not possible count
-    if possible is not None and not surely_below(positions, far):
-        positions = only(positions, possible[..., None])
     position = (share[..., None] * positions).sum(dim=-2)
     offset = positions - position.unsqueeze(-2)
     covariance = (share[..., None] * offset).mT @ offset
@@ -248,7 +245,7 @@ def match_joint(
     check_bool(mask=samples.mask)
     scores, finite = finite_or_zero(scores.squeeze(-2), dims=0)
     seen = only(samples.mask.squeeze(-2), finite, other=False)
-    count = seen.sum(dim=-3)
+    count = seen.to(scores.dtype).sum(dim=-3)
     mean = safe_divide(only(scores, seen).sum(dim=-3), count, count > 0)
     inv_depth = samples.inv_depth.select(-3, 0)
     found = soft_argmax(mean, inv_depth[..., None], mask=count > 0, window=window)

@@ -35,6 +35,7 @@ AT_LEAST_SINGLE = {
 }
 # Ends of segments are in the image or not by rounding, and poses in half precision rigid.
 BY_ROUNDING = {"correlate, lines", "is_rigid"}
+SCORES = {"correlate", "correlate, lines", "correlate_normalized"}
 TAKES_PARTS = {  # of tensors: the table above, not the function
     "correlate",
     "correlate_normalized",
@@ -129,6 +130,39 @@ def test_what_is_not_finite_is_answered_finitely_and_alone(name: str, turn: int)
                 assert ours.isfinite().all(), f"gradient of {leaf}, {where}"
                 if leaf == spoilt:
                     assert ours[1].flatten()[place] == 0, where
+
+
+# Sums of products of features overflow: a score that is not finite counts as masked.
+@pytest.mark.parametrize("name", sorted(OPERATIONS.keys() - REWRITES - SCORES))
+def test_finite_numbers_of_any_size_make_no_nan(name: str) -> None:
+    operation, given = OPERATIONS[name], chosen(OPERATIONS[name], inputs_in(torch.float32))
+    most = torch.finfo(torch.float32).max
+    sizes = {"0": lambda x: 0 * x, "large": lambda x: most**0.5 * x, "most": lambda x: 0 * x + most}
+    nan = [
+        f"{size} {spoilt}"
+        for spoilt in real_names(given)
+        for size, of in sizes.items()
+        if any(
+            each.isnan().any()
+            for each in tensors_of(operation(**given | {spoilt: of(given[spoilt])}))
+        )
+    ]
+    assert not nan
+
+
+@pytest.mark.parametrize("name", OPERATIONS | METHODS)
+def test_defaults_of_torch_do_not_matter(name: str) -> None:
+    operation = (OPERATIONS | METHODS)[name]
+    given = chosen(operation, inputs_in(torch.float32))
+    plain = tensors_of(operation(**given))
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            found = tensors_of(operation(**given))
+    finally:
+        torch.set_default_dtype(before)
+    assert_close(found, plain)
 
 
 @pytest.mark.parametrize("view", [0, 1, 2])
