@@ -145,7 +145,7 @@ def _figures(scores: CaptureScores) -> dict[str, Any]:
 
 
 def _cost(predictor: Predictor) -> dict[str, Any]:
-    """Of a network at the paper's setting; nothing of a method that is none."""
+    """Of a network at the paper's setting; nothing of a method that is none, or a part of one."""
     network = _network_of(predictor)
     if network is None:
         return {}
@@ -155,7 +155,7 @@ def _cost(predictor: Predictor) -> dict[str, Any]:
 
 def _network_of(predictor: Predictor) -> nn.Module | None:
     if isinstance(predictor, DeltasPredictor):
-        return predictor.encode.model
+        return None if predictor.without_points else predictor.encode.model
     if isinstance(predictor, ReferencePredictor):
         return predictor.network
     return predictor.model if isinstance(predictor, DensePredictor) else None

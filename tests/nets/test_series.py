@@ -253,6 +253,10 @@ def test_a_disturbed_network_keeps_its_disturbance_under_other_settings(model: D
     assert (unit.factor, unit.told) == (3.0, True)
 
 
+def test_the_cost_of_a_network_is_not_said_of_a_part_of_it(model: Deltas) -> None:
+    assert measuring._cost(DeltasPredictor(model, without_points=True)) == {}
+
+
 def test_the_published_checkpoint_has_the_settings_that_ours_lacks(
     run: Run, tmp_path: Path, weights: Path
 ) -> None:
