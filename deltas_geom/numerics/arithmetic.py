@@ -175,7 +175,8 @@ def values_at_hand(tensor: Tensor) -> bool:
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return False
-    return type(tensor) in (Tensor, Parameter) and tensor.is_cpu
+    # NumPy does not know numbers whose sign is turned when they are read, as of a conjugate.
+    return type(tensor) in (Tensor, Parameter) and tensor.is_cpu and not tensor.is_neg()
 
 
 def unless_all(mask: Tensor) -> Tensor | None:

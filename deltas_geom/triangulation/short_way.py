@@ -59,7 +59,7 @@ class ShortWay:
         """Gradients by cameras, pixels and weights of points with this gradient."""
         known = self._last is not None and self._last[0] == _place_of(pixels)
         solved = self._last[1] if self._last and known else self._solve(pixels, weights, mask)
-        outer = gradient.numpy().astype(np.float64)
+        outer = gradient.resolve_neg().numpy().astype(np.float64)
         proj, by_pixels, by_size = gradients(
             self.rig, solved, outer, fixed=self.fixed, of_cameras=needed[0]
         )

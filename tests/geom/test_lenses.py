@@ -100,6 +100,22 @@ def test_the_mask_is_the_domain_that_can_be_seen_from_the_axis(name: str) -> Non
     assert np.mean(found == seen_from_the_axis(case, pixels)) >= 0.999
 
 
+@pytest.mark.parametrize("zero", [0.0, -0.0, 1e-300])
+@pytest.mark.parametrize("model", [model for model in CASES if CASES[model].coefficients])
+def test_without_distortion_a_lens_is_ideal(model: str, zero: float) -> None:
+    lens, pixels = CASES[model].lens(), pixels_of(200)
+    coefficients = torch.full_like(lens.coefficients, zero)
+    if model == "EUCM":
+        coefficients[1] = 1
+    rays, valid = Lens(lens.K, coefficients, model).unproject(pixels)
+    ideal = Lens(lens.K, coefficients[:0], "FISHEYE" if "FISHEYE" in model else "PINHOLE")
+    assert valid.all()
+    assert_close(rays, ideal.unproject(pixels).rays, rtol=0, atol=1e-14)
+    seen = Lens(lens.K, coefficients, model).project(rays)
+    assert seen.valid.all()
+    assert_close(seen.pixels, pixels, rtol=0, atol=1e-10)
+
+
 @EACH
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_many_pixels_have_the_rays_that_few_have(name: str, dtype: torch.dtype) -> None:

@@ -222,4 +222,5 @@ def _first_root(coefficients: Sequence[Tensor]) -> Tensor:
     # Two roots that are nearly one are a bit apart from the real line, by the root of rounding.
     close = 64 * math.sqrt(torch.finfo(c.dtype).eps)
     real = inverse.imag.abs() <= close * inverse.real
-    return torch.where(real, inverse.real, 0.0).amax(dim=-1).clamp(min=0).reciprocal()
+    # Of coefficients that are all 0 the largest may be -0, whose reciprocal is not the same.
+    return torch.where(real, inverse.real, 0.0).amax(dim=-1).clamp(min=0).abs().reciprocal()
