@@ -415,6 +415,7 @@ def test_distillation_changes_the_detector_alone_and_is_repeatable(tmp_path: Pat
             steps=2,
             batch_size=2,
             num_images=2,
+            adaptation=2,
             picture_share=1.0,
             gain=10.0,
         )
