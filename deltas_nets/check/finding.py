@@ -26,6 +26,8 @@ class Fault(Enum):
     FEW_MATCHES = "images hardly match: nothing can be told of their cameras"
     NONSENSE_CALIBRATION = "no camera has such intrinsics"
     NONSENSE_LENS = "no lens bends lines like that"
+    LENS_TWICE = "a lens is stated, but images are straight already"
+    LENS_MISSING = "images bend lines, but no lens is stated"
     K_TRANSPOSED = "K is transposed"
     K_OF_OTHER_SIZE = "K is of images of another size"
     K_OF_SOME_FRAMES = "the K of some frames is of images of another size"

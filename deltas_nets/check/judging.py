@@ -11,6 +11,7 @@ from deltas_geom.diagnosis.trials import level
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.axes import other_axes
+from deltas_nets.check.bent import LENSES, wrong_lenses_of_matches
 from deltas_nets.check.depth_camera import unregistered_depth
 from deltas_nets.check.evidence import evidence_of
 from deltas_nets.check.finding import Fault, Finding
@@ -68,6 +69,8 @@ def judge_matches(capture: Capture, matched: Matched) -> tuple[list[Finding], Fi
         total, looked, pairs, int(evidence.counts.sum()), float(given.median()), fit, 0.0
     )
     found = _explained(capture, matched, evidence, given)
+    if found and found[0].cause in LENSES:
+        return found, figures
     return [*found, *_by_sensor(_same_frames(capture, found), matched, evidence)], figures
 
 
@@ -108,6 +111,7 @@ def _explained(
             of_all_cameras(diagnosis),
             poses_of_other_frames(capture, matched, evidence),
             *wrong_kinds(capture, matched, evidence),
+            *wrong_lenses_of_matches(capture, matched, evidence),
         )
         if suspect is not None
     ]
