@@ -9,7 +9,7 @@ from torch import Tensor
 
 from deltas_geom import Lens, PosedViews
 from deltas_geom.cameras.pixels import resize_intrinsics
-from deltas_geom.diagnosis.evidence import Evidence, gather_evidence, residuals
+from deltas_geom.diagnosis.evidence import SHARE, Evidence, gather_evidence, residuals
 from deltas_geom.diagnosis.trials import level
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
@@ -136,9 +136,10 @@ def _suspect(
     moved = gather_evidence(pixels, seen)
     mostly, quarter = (
         Tried(
-            level(residuals(evidence, *views, **share)), level(residuals(moved, *mended, **share))
+            level(residuals(evidence, *views, share=share)),
+            level(residuals(moved, *mended, share=share)),
         )
-        for share in ({"share": MOSTLY}, {})
+        for share in (MOSTLY, SHARE)
     )
     least = min(_LEFT * mostly.given, ENOUGH)
     if mostly.given - mostly.after < _LEAST_GAIN or mostly.after > least:
