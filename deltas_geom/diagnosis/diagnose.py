@@ -58,6 +58,12 @@ def diagnose(
         True
     """
     seen = _checked(views, pixels, mask, threshold)
+    # All that is compared is there, and so must be what is made on the way.
+    with torch.device("cpu"):
+        return _diagnosed(views, pixels, seen, threshold)
+
+
+def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float) -> Diagnosis:
     K, pose = (tensor.detach().cpu().double() for tensor in views)
     where = pixels.detach().cpu().double().nan_to_num()
     evidence = gather_evidence(where, seen)

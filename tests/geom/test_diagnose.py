@@ -202,6 +202,9 @@ def test_float32_is_enough() -> None:
     found = diagnosed((K, invert_pose(pose) @ FLIP.float(), pixels))
     assert found.cause is Cause.OPENGL_WORLD_FROM_CAM
     assert found.mended.views.cam_from_world.dtype == torch.float32
+    with torch.device("meta"):  # torch's default does not matter
+        again = diagnosed((K, invert_pose(pose) @ FLIP.float(), pixels))
+    assert again.cause is found.cause
 
 
 # What cannot be told is said to be so.
