@@ -20,6 +20,7 @@ from deltas_nets.commands.export import Export
 from deltas_nets.commands.fuse import Fuse
 from deltas_nets.commands.page import Page
 from deltas_nets.commands.recipe import Recipe
+from deltas_nets.commands.redraw import Redraw
 from deltas_nets.commands.robustness import Robustness
 from deltas_nets.commands.train import Train
 from deltas_nets.commands.view import View
@@ -39,6 +40,7 @@ COMMANDS = (
     Train,
     Recipe,
     Distill,
+    Redraw,
     Calibrate,
     Export,
     Cost,

@@ -20,6 +20,8 @@ from deltas_nets.outputs.atomic_files import write_atomically
 
 DEFAULT = "deltas-small"
 FORMAT = "1"
+REDRAW = "redraw."
+"""What the names of the weights of the stage that redraws begin with."""
 
 
 def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = "cpu") -> Deltas:
@@ -126,6 +128,8 @@ def load_weights(model: torch.nn.Module, file: Path) -> None:
 def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
     """Copy a file's weights into a model that may have grown since; training goes on from there.
 
+    A stage that redraws stays behind where the model has none: it follows features that change.
+
     Returns:
         Weights that the file lacks: they stay as they are.
 
@@ -136,6 +140,8 @@ def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
     with safe_open(str(file), framework="pt") as opened:
         state = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     own = model.state_dict()
+    if not any(name.startswith(REDRAW) for name in own):
+        state = {name: value for name, value in state.items() if not name.startswith(REDRAW)}
     grown = {name: value for name, value in own.items() if name not in state}
     if 2 * len(grown) > len(own):
         raise UserError(

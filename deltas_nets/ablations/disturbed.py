@@ -16,6 +16,7 @@ from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
 from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
@@ -55,6 +56,10 @@ class Disturbed:
         """Depth of the first frame from what was made of all."""
         changed = [self.change(frame) for frame in wanted.frames]
         return self.inner.depth_map(wanted._replace(frames=changed))
+
+    def redrawn(self, anchor: Frame, agreed: KnownDepth) -> KnownDepth:
+        """As the network, which sees the changed image."""
+        return self.inner.redrawn(self.change(anchor), agreed)
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """As the network."""

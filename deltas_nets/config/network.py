@@ -88,6 +88,9 @@ class NetworkConfig:
     densifier_widths: tuple[int, ...] = (32, 48, 64, 96)
     """Channels of the densifier: lite at 1/2, 1/4, 1/8, 1/16; else of the five blocks of the
     decoder, coarse to fine."""
+    redraws: bool = False
+    """lite: a second densifier, of the same widths, draws maps anew that several frames agreed on;
+    `deltas redraw` trains it when all else is trained."""
 
     def __post_init__(self) -> None:
         if self.backbone not in ENCODERS:
@@ -105,3 +108,5 @@ class NetworkConfig:
             raise ValueError(f"the {kind} matcher needs the lite backbone, got {self.backbone}")
         if not lite and self.descriptor_stride != 2:
             raise ValueError(f"descriptor_stride is of the lite backbone, got {self.backbone}")
+        if self.redraws and (not lite or self.matcher.kind == "volume"):
+            raise ValueError("redraws is of networks of points with the lite backbone")

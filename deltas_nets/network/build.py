@@ -11,6 +11,7 @@ from deltas_nets.network.lite.densifier import Densifier
 from deltas_nets.network.lite.descriptor import Descriptor
 from deltas_nets.network.lite.detector import Detector
 from deltas_nets.network.lite.encoder import LiteEncoder
+from deltas_nets.network.lite.redraw import Redraw
 from deltas_nets.network.paper.paper import (
     PaperDensifier,
     PaperDescriptor,
@@ -26,7 +27,7 @@ Matcher = JointMatcher | PerViewMatcher
 class Stages(NamedTuple):
     """What :class:`deltas_nets.network.deltas.Deltas` composes, in order.
 
-    Only the joint matcher has a judge.
+    Only the joint matcher has a judge; only networks whose config says so redraw.
     """
 
     encoder: LiteEncoder | PaperEncoder
@@ -35,6 +36,7 @@ class Stages(NamedTuple):
     matcher: Matcher
     judge: Judge | None
     densifier: Densifier | PaperDensifier
+    redraw: Redraw | None
 
 
 def build_stages(config: NetworkConfig) -> Stages:
@@ -56,6 +58,7 @@ def _lite_stages(config: NetworkConfig, encoder: LiteEncoder, matcher: Matcher) 
         matcher,
         Judge(config.matcher.window) if config.matcher.kind == "joint" else None,
         Densifier(_four(config.densifier_widths), channels),
+        Redraw(_four(config.densifier_widths), channels) if config.redraws else None,
     )
 
 
@@ -69,6 +72,7 @@ def _paper_stages(
         matcher,
         None,  # a point's confidence is its matches' weight
         PaperDensifier(sparse, image.channels, _five(config.densifier_widths)),
+        None,
     )
 
 

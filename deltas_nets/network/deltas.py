@@ -61,6 +61,7 @@ class Deltas(nn.Module):
         self.matcher = stages.matcher
         self.judge = stages.judge
         self.densifier = stages.densifier
+        self.redraw = stages.redraw
 
     @property
     def dtype(self) -> torch.dtype:
@@ -214,6 +215,20 @@ class Deltas(nn.Module):
         # A Laplace distribution deviates by sqrt(2) of its scale.
         log_std = upsample_to(dense.log_spread, size) + 0.5 * math.log(2)
         return Densified(dense, depth, self.calibration(log_std, num_views).exp() * depth)
+
+    def redrawn(self, encoded: Encoded, agreed: KnownDepth) -> KnownDepth:
+        """A map that several frames agreed on, with the edges that the image shows.
+
+        Its deviation stays. Without a stage that redraws, as in networks of which `deltas redraw`
+        trained none, so does its depth.
+
+        Args:
+            encoded: the anchor, or a view set whose first view it is, of B images.
+            agreed: ``(B, 1, H, W)``.
+        """
+        if self.redraw is None:
+            return agreed
+        return agreed._replace(depth=self.redraw(encoded.features, agreed).log_depth[0].exp())
 
     def complete(self, encoded: Encoded, known: KnownDepth) -> Densified:
         """A map of one image and depth that is known of it; no other view is looked at.

@@ -1,6 +1,6 @@
 """The later passes over a capture: each map hears those of the frames around it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -12,18 +12,23 @@ from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.neighbours import neighbours, sample
-from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.straight import straight
 from deltas_nets.errors import UserError
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
 from deltas_nets.predict.look import as_photographed
+from deltas_nets.predict.reach import unit_of
 
 __all__ = ["LaterPasses"]
 
 REMEMBERED = 64
 """Maps of a pass that are kept in memory: 0.7 MB each."""
+
+
+Redrawn = Callable[[Frame, KnownDepth], KnownDepth]
+"""As of :class:`deltas_nets.predict.predictor.Predictor`."""
 
 
 class _First(NamedTuple):
@@ -44,13 +49,16 @@ class LaterPasses:
         capture: the frames.
         first: the maps of the first pass.
         ids: the frames that have one.
+        redrawn: the last touch that a map of a frame gets.
 
     Raises:
         UserError: a map is missing or damaged.
     """
 
-    def __init__(self, capture: Capture, first: FirstMaps, ids: Sequence[str]) -> None:
-        self.capture = capture
+    def __init__(
+        self, capture: Capture, first: FirstMaps, ids: Sequence[str], redrawn: Redrawn
+    ) -> None:
+        self.capture, self.redrawn = capture, redrawn
         self.first = first
         self._read = lru_cache(maxsize=2 * REMEMBERED)(self._from_disk)
         points, views, sizes = [], [], []
@@ -92,9 +100,24 @@ class LaterPasses:
         of_straight = config if anchor is photo else replace(config, size=None)
         size = (found.depth.shape[-2], found.depth.shape[-1])
         nothing = KeypointDepths(torch.zeros(0, 2), torch.zeros(0), size)
-        result = finished_map(anchor, found, nothing, of_straight)
+        result = finished_map(anchor, self.drawn(id, found), nothing, of_straight)
         # A copy: the map stays in memory, and what is added to its record is not of the first pass.
         return as_photographed(result, anchor, config), dict(self._read(self.first, id).record)
+
+    @torch.inference_mode()
+    def drawn(self, id: str, found: KnownDepth) -> KnownDepth:
+        """A map that has heard, as its image shows it.
+
+        Raises:
+            UserError: the image cannot be read.
+        """
+        known = found.depth[found.depth > 0]
+        if not len(known):
+            return found
+        anchor = straight(self.capture.frame(id))
+        unit = unit_of(float(known.median()), self.capture.metric)
+        drawn = self.redrawn(anchor, found._replace(depth=found.depth * unit))
+        return drawn._replace(depth=drawn.depth / unit)
 
     def _from_disk(self, told: FirstMaps, id: str) -> _First:
         read = told.read(id)

@@ -93,6 +93,18 @@ class DeltasPredictor:
             return map_without_points(self.encode, frames[0], config, work_size=size)
         return predict_frame(self.encode, frames, config, measured).map
 
+    @torch.inference_mode()
+    def redrawn(self, anchor: Frame, agreed: KnownDepth) -> KnownDepth:
+        """By the stage that redraws, if the network has one."""
+        model = self.encode.model
+        if model.redraw is None:
+            return agreed
+        size = (agreed.depth.shape[-2], agreed.depth.shape[-1])
+        _, encoded = self.encode([anchor], work_size=size)
+        device = next(model.parameters()).device
+        of_one = KnownDepth(*(part[None].to(device) for part in agreed))
+        return KnownDepth(*(part[0].cpu() for part in model.redrawn(encoded, of_one)))
+
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """The network itself."""
         return self.encode.model

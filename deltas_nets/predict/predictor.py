@@ -7,13 +7,14 @@ from typing import Any, Literal, Protocol
 import torch
 
 from deltas_nets import reference
-from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.baselines import BASELINES
 from deltas_nets.config.lookup import look_up
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.dense import DensePredictor
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
 from deltas_nets.predict.ours import DeltasPredictor
@@ -53,6 +54,20 @@ class Predictor(Protocol):
         Raises:
             UserError: an image cannot be read; the network does not take measured depth, or there
                 is neither a source nor such depth.
+        """
+
+    def redrawn(self, anchor: Frame, agreed: KnownDepth) -> KnownDepth:
+        """A map that several frames agreed on, with the edges that its image shows.
+
+        Args:
+            anchor: its frame, straight.
+            agreed: ``(1, h, w)``, of the size that the network works at.
+
+        Returns:
+            As good a map as the network can make of it; the same if it has no stage for that.
+
+        Raises:
+            UserError: the image cannot be read.
         """
 
     def varied(self, settings: NetworkSettings) -> "Predictor":

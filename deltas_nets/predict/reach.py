@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["ROOM", "Reach", "end_of_pile", "reach_of", "reach_within", "wider"]
+__all__ = ["ROOM", "Reach", "end_of_pile", "reach_of", "reach_within", "unit_of", "wider"]
 
 ROOM = (0.5, 10.0)
 """Metres that are searched where nothing says otherwise: what the network was trained with."""
@@ -54,7 +54,7 @@ def reach_of(depths: ArrayLike, *, metric: bool) -> Reach:
         Reach(near=40.0, far=800.0, unit=0.0125)
     """
     nearest, median, farthest = (float(d) for d in np.percentile(np.asarray(depths), (2, 50, 98)))
-    unit = _unit(median, metric)
+    unit = unit_of(median, metric)
     near, far = ROOM
     return Reach(min(near / unit, nearest / BEYOND), max(far / unit, farthest * BEYOND), unit)
 
@@ -65,11 +65,11 @@ def reach_within(near: float, far: float, *, metric: bool) -> Reach:
     A narrow one is searched as a room is: depth of three captures without metres is better so, and
     depth in metres does not depend on the format that the capture came in.
     """
-    unit = _unit(2 / (1 / near + 1 / far), metric)
+    unit = unit_of(2 / (1 / near + 1 / far), metric)
     return Reach(min(ROOM[0] / unit, near), max(ROOM[1] / unit, far), unit)
 
 
-def _unit(median: float, metric: bool) -> float:
+def unit_of(median: float, metric: bool) -> float:
     """Metres that the network takes a unit for where surfaces are typically so far."""
     return 1.0 if metric and AS_IN_ROOMS[0] <= median <= AS_IN_ROOMS[1] else USUAL / median
 

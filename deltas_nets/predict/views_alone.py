@@ -3,8 +3,10 @@ of a network of deltas."""
 
 from pathlib import Path
 
+from deltas_nets.captures.frame import Frame
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import PredictConfig, Wanted
 
 __all__ = ["ViewsAlone"]
@@ -37,6 +39,10 @@ class ViewsAlone:
         if config.min_confidence > 0:
             what = f"{self.called} states no confidence"
             raise UserError(what, "--min-confidence", "leave it out")
+
+    def redrawn(self, anchor: Frame, agreed: KnownDepth) -> KnownDepth:
+        """It stays: there is no stage that redraws."""
+        return agreed
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """It is none."""

@@ -1,6 +1,5 @@
 """Intrinsics that a user states, and cameras known by name."""
 
-
 import numpy as np
 import pytest
 

@@ -1,0 +1,38 @@
+"""The command `deltas redraw`: a stage that draws agreed maps anew."""
+
+from dataclasses import dataclass
+
+from deltas_nets.commands.command import Command
+from deltas_nets.commands.flags import Flag
+from deltas_nets.config.redraw import RedrawConfig
+
+
+@dataclass(frozen=True)
+class Redraw(RedrawConfig, Command):
+    """Train the stage that draws a map anew after several frames agreed on it.
+
+    Nothing else of the network changes, nor do maps of one pass. It learns from procedural rooms:
+    from the network's own maps of them, with errors as they are left where neighbours agree.
+    --init goes on from weights that have the stage; a network that learns on (`deltas train
+    --init`) loses it.
+
+    Example: deltas redraw --out mine.safetensors --log mine.jsonl
+    """
+
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, mps."""
+    overwrite: Flag = False
+    """Replace --out if it exists."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from deltas_nets.commands.flags import usable_device
+        from deltas_nets.terminal import progress
+        from deltas_nets.train.redraw import train_redraw
+
+        device = usable_device(self.device)
+        with progress("redraw", self.steps) as report:
+            train_redraw(self, device=device, overwrite=self.overwrite, report=report)
+        print(f"weights in {self.out}")
