@@ -6,7 +6,7 @@ stage learns to draw them as the rooms are. The command is `deltas redraw`.
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -236,8 +236,10 @@ def record_of(config: RedrawConfig, before: dict[str, str], step: int) -> dict[s
         step: how many are done.
     """
     kept = {name: value for name, value in before.items() if name not in _OF_OTHER_WEIGHTS}
-    settings: dict[str, Any] = asdict(config)
-    public = {name: value for name, value in settings.items() if name not in _PLACES}
+    own: dict[str, Any] = {
+        field.name: getattr(config, field.name) for field in fields(RedrawConfig)
+    }
+    public = {name: value for name, value in own.items() if name not in _PLACES}
     trained = json.dumps(public)
     earlier = [before["redraw_config"]] if "redraw_config" in before else []
     return kept | {
