@@ -177,7 +177,7 @@ def keep_means(file: Path) -> None:
 
 def key_of(part: Part, code: str) -> str:
     """Of what decides a part's figures: commands, code, and what was given."""
-    given = [f"{path.resolve()} {path.stat().st_mtime}" for path in sorted(GIVEN.iterdir())]
+    given = [f"{path.resolve()} {path.stat().st_mtime}" for path in sorted(GIVEN.glob("*"))]
     links = [text for text in given if str(GIVEN.resolve()) not in text]
     files = [GIVEN / "weights" / file for file in LEARNED.values()]
     sizes = [f"{file.name} {file.stat().st_size}" for file in files if file.exists()]

@@ -99,7 +99,11 @@ def test_pycolmap_reads_what_we_write(
     tmp_path_factory: pytest.TempPathFactory, to: str, capture: Capture
 ) -> None:
     folder = tmp_path_factory.mktemp("written") / "out"
-    save_capture(capture, folder, to)
+    said = save_capture(capture, folder, to)
+    cut = to == "colmap" and any(" " in id for id in capture.frames)
+    assert cut == any("colmap-bin" in what for what in said)
+    if cut:  # by what reads a name up to a space
+        return
     theirs = pycolmap.Reconstruction(folder / "sparse" / "0")
     assert_as_pycolmap(read_model(folder / "sparse" / "0"), theirs)
     points = 0 if capture.points is None else len(capture.points.xyz)

@@ -26,7 +26,11 @@ def write_text(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     """Write text files; see `deltas_nets.captures.writers` for the contract."""
     model = _put_images(capture, folder, putting)
     write_text_model(model, folder / "sparse" / "0")
-    return _left_out(capture)
+    cut = [name for name in model.images.names if " " in name]
+    if not cut:
+        return _left_out(capture)
+    known = f"COLMAP reads names in text up to a space ({cut[0]}): --to colmap-bin keeps them whole"
+    return [*_left_out(capture), known]
 
 
 def write_binary(capture: Capture, folder: Path, putting: Putting) -> list[str]:

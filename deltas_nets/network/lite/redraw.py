@@ -45,8 +45,8 @@ def kept_at_large(log_depth: Tensor, agreed: Tensor) -> Tensor:
 
     Example:
         >>> drawn, agreed = torch.zeros(1, 1, 20, 30), torch.full((1, 1, 20, 30), 2.0)
-        >>> kept_at_large(drawn, agreed).exp().unique()
-        tensor([2.0000])
+        >>> round(float(kept_at_large(drawn, agreed).exp().max()), 4)
+        2.0
     """
     known = agreed > 0
     off = torch.where(known, torch.where(known, agreed, 1.0).log() - log_depth, 0.0)
