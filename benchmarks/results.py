@@ -96,11 +96,11 @@ def link(given: dict[str, Path]) -> None:
     """Put what is given where commands name it."""
     GIVEN.mkdir(exist_ok=True)
     for name, path in given.items():
-        place = GIVEN / name
+        place, there = GIVEN / name, path.resolve()  # before the link goes: it may be what is named
         if place.is_symlink():
             place.unlink()
         if not place.exists():
-            place.symlink_to(path.resolve(), target_is_directory=True)
+            place.symlink_to(there, target_is_directory=True)
 
 
 def measure(only: Sequence[str] | None, jobs: int, *, only_say: bool) -> None:
