@@ -16,7 +16,7 @@ from deltas_nets.config.baselines import BASELINES
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.networks import Network, build_network
-from deltas_nets.outputs.atomic_files import write_atomically
+from deltas_nets.outputs.atomic_files import check_writable, write_atomically
 
 DEFAULT = "deltas-small"
 FORMAT = "1"
@@ -161,6 +161,21 @@ def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
         raise UserError(
             f"weights do not fit the network ({first})", file, "use the config they were trained by"
         ) from None
+
+
+def check_new_weights(file: Path, *, overwrite: bool) -> None:
+    """Whether weights can be written to a file, before hours of work.
+
+    Raises:
+        UserError: it is no .safetensors file, is a folder, exists already, or cannot be written.
+    """
+    if file.suffix != ".safetensors":
+        raise UserError("weights are .safetensors", file, "name such a file with --out")
+    if file.is_dir():
+        raise UserError("this is a folder, not a file", file, "name a file with --out")
+    if file.exists() and not overwrite:
+        raise UserError("the file exists", file, "add --overwrite or name a new file")
+    check_writable(file.parent)
 
 
 def save_weights(file: Path, model: Network, metadata: Mapping[str, str]) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.config.checks import check_at_least, check_positive, check_seed
+from deltas_nets.config.training import DataConfig, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,39 @@ class RedrawConfig:
         check_seed(self)
         if self.batch_size < REPLAY or self.batch_size % REPLAY:
             raise ValueError(f"batch_size must be a multiple of {REPLAY}, got {self.batch_size}")
+        for size in self.sizes:
+            if min(size) < 32:
+                raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {size}")
+        if self.first_room < VALIDATED:
+            what = f"first_room must be {VALIDATED} or more, as no training sees those below"
+            raise ValueError(f"{what}; got {self.first_room}")
+        self.of_rooms()
+
+    def of_rooms(self) -> TrainConfig:
+        """How rooms are rendered and seen."""
+        data = DataConfig(
+            num_rooms=self.num_rooms,
+            seed=self.first_room,
+            num_views=self.num_views + 2,
+            height=max(height for height, _ in self.sizes),
+            width=max(width for _, width in self.sizes),
+            cache=None if self.cache is None else str(self.cache),
+            workers=self.workers,
+            replay=REPLAY,
+            shelf=10,
+        )
+        return TrainConfig(
+            data=data,
+            steps=self.steps,
+            sizes=self.sizes,
+            batch_size=self.batch_size,
+            min_views=self.num_views,
+            max_views=self.num_views,
+            seed=self.seed,
+        )
 
 
 REPLAY = 4
 """Steps in which a rendered room is seen."""
+VALIDATED = 1000
+"""Seeds below are those of rooms that are measured on."""

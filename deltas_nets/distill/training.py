@@ -29,7 +29,13 @@ from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.features import Features
 from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.outputs.atomic_files import check_writable
-from deltas_nets.weights_file import load_model, read_metadata, save_weights, weights_file
+from deltas_nets.weights_file import (
+    check_new_weights,
+    load_model,
+    read_metadata,
+    save_weights,
+    weights_file,
+)
 
 __all__ = ["DistillConfig", "distill", "record_of", "train_detector", "with_fine_branch"]
 
@@ -103,13 +109,7 @@ def distill(
 
 def _check_places(config: DistillConfig, *, overwrite: bool) -> None:
     """Whether what is written can be, before an hour's work."""
-    if config.out.suffix != ".safetensors":
-        raise UserError("weights are .safetensors", config.out, "name such a file with --out")
-    if config.out.is_dir():
-        raise UserError("this is a folder, not a file", config.out, "name a file with --out")
-    if config.out.exists() and not overwrite:
-        raise UserError("the file exists", config.out, "add --overwrite or name a new file")
-    check_writable(config.out.parent)
+    check_new_weights(config.out, overwrite=overwrite)
     if config.cache is not None:
         if config.cache.is_file():
             what = "this is a file, not a folder"

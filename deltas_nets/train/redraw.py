@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_nets.config import LossConfig, TrainConfig
-from deltas_nets.config.redraw import REPLAY, RedrawConfig
+from deltas_nets.config import LossConfig
+from deltas_nets.config.redraw import RedrawConfig
 from deltas_nets.config.schedule import rate_factor
-from deltas_nets.config.training import DataConfig
 from deltas_nets.datasets.agreed_maps import agreed_like
 from deltas_nets.errors import UserError
 from deltas_nets.losses.losses import training_losses
@@ -31,7 +30,13 @@ from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batches import Batch, BatchMaker
 from deltas_nets.train.loader import room_loader
 from deltas_nets.train.step import DEPTH_RANGE
-from deltas_nets.weights_file import load_model, read_metadata, save_weights, weights_file
+from deltas_nets.weights_file import (
+    check_new_weights,
+    load_model,
+    read_metadata,
+    save_weights,
+    weights_file,
+)
 
 __all__ = ["RedrawConfig", "learns", "train_redraw", "with_redraw"]
 
@@ -83,11 +88,9 @@ def train_redraw(
         UserError: a file is missing or holds another network, or exists already, before anything is
             computed; or training diverged.
     """
-    if config.out.suffix != ".safetensors":
-        raise UserError("weights are .safetensors", config.out, "name such a file with --out")
-    if config.out.exists() and not overwrite:
-        raise UserError("the file exists", config.out, "add --overwrite or name a new file")
-    check_writable(config.out.parent)
+    check_new_weights(config.out, overwrite=overwrite)
+    if config.log is not None:
+        check_writable(config.log.parent)
     model = with_redraw(load_model(config.init).to(device), weights_file(config.init))
     assert model.redraw is not None
     before = read_metadata(weights_file(config.init))
@@ -152,27 +155,7 @@ def lessons(
     model: Deltas, config: RedrawConfig, device: str | torch.device = "cpu"
 ) -> Iterator[Lesson]:
     """What each step learns from."""
-    data = DataConfig(
-        num_rooms=config.num_rooms,
-        seed=config.first_room,
-        num_views=config.num_views + 2,
-        height=max(height for height, _ in config.sizes),
-        width=max(width for _, width in config.sizes),
-        cache=None if config.cache is None else str(config.cache),
-        workers=config.workers,
-        replay=REPLAY,
-        shelf=10,
-    )
-    of_rooms = TrainConfig(
-        network=model.config,
-        data=data,
-        steps=config.steps,
-        sizes=config.sizes,
-        batch_size=config.batch_size,
-        min_views=config.num_views,
-        max_views=config.num_views,
-        seed=config.seed,
-    )
+    of_rooms = config.of_rooms()
     make = BatchMaker(of_rooms)
     for step, rooms in enumerate(room_loader(of_rooms, start=0, stop=config.steps)):
         on_device = rooms.map(lambda tensor: tensor.to(device))

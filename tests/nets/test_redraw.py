@@ -210,6 +210,10 @@ def test_trained_stages_go_on(plain: Deltas, tmp_path: Path) -> None:
         (("--out", "weights.pt"), (".safetensors",)),
         (("--out", "w.safetensors", "--init", "nothing"), ("no such weights",)),
         (("--out", "w.safetensors", "--batch-size", 6), ("multiple of 4",)),
+        (("--out", "w.safetensors", "--num-rooms", 0), ("num_rooms",)),
+        (("--out", "w.safetensors", "--sizes", 10, 10), ("32 or more",)),
+        (("--out", "w.safetensors", "--first-room", 5), ("1000 or more",)),
+        (("--out", "w.safetensors", "--log", "/dev/null/x.jsonl"), ("/dev/null",)),
         (("--out", "w.safetensors", "--init", "no-points"), ("no such weights",)),
     ],
 )
