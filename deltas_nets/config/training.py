@@ -25,6 +25,9 @@ class DataConfig:
     """rooms: how many in an epoch."""
     seed: int = 1000
     """rooms: seed of the first one; validation rooms have seeds below 1000."""
+    close_ups: float = 0.0
+    """rooms: share of them that are desks, shelves and floors from near by, enlarged as the network
+    sees what is nearer than rooms are."""
     num_views: int = 5
     """rooms: views rendered of each; any of them can be the anchor."""
     height: int = 192
@@ -53,6 +56,8 @@ class DataConfig:
         check_at_least(1, self, "num_rooms")
         check_at_least(2, self, "num_views")
         check_at_least(32, self, "height", "width")
+        if not 0 <= self.close_ups <= 1:
+            raise ValueError(f"close_ups must be within [0, 1], got {self.close_ups}")
         if self.replay < 1 or self.shelf < 1:
             raise ValueError(
                 f"replay and shelf must be at least 1, got {self.replay} and {self.shelf}"

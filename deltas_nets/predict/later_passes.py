@@ -16,10 +16,10 @@ from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.straight import straight
 from deltas_nets.errors import UserError
 from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.network.unit import unit_of
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
 from deltas_nets.predict.look import as_photographed
-from deltas_nets.predict.reach import unit_of
 
 __all__ = ["LaterPasses"]
 

@@ -9,14 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["ROOM", "Reach", "end_of_pile", "reach_of", "reach_within", "unit_of", "wider"]
+from deltas_nets.network.unit import unit_of
+
+__all__ = ["ROOM", "Reach", "end_of_pile", "reach_of", "reach_within", "wider"]
 
 ROOM = (0.5, 10.0)
 """Metres that are searched where nothing says otherwise: what the network was trained with."""
-USUAL = 2.5
-"""Metres of the median depth that the network sees of a capture without metres."""
-AS_IN_ROOMS = (1.0, 6.0)
-"""Metres: a median depth within them is left as it is."""
 BEYOND = 1.25
 """The search goes on beyond the nearest and the farthest known point by this factor."""
 WIDER = 10.0
@@ -67,11 +65,6 @@ def reach_within(near: float, far: float, *, metric: bool) -> Reach:
     """
     unit = unit_of(2 / (1 / near + 1 / far), metric)
     return Reach(min(ROOM[0] / unit, near), max(ROOM[1] / unit, far), unit)
-
-
-def unit_of(median: float, metric: bool) -> float:
-    """Metres that the network takes a unit for where surfaces are typically so far."""
-    return 1.0 if metric and AS_IN_ROOMS[0] <= median <= AS_IN_ROOMS[1] else USUAL / median
 
 
 def end_of_pile(depths: ArrayLike, reach: Reach) -> str | None:

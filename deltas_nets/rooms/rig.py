@@ -14,6 +14,7 @@ BASELINE_RANGE = (0.03, 0.6)  # m, between any two views of one rig
 WALL_MARGIN = 0.4  # m, no camera comes nearer to a wall, the floor or the ceiling
 MAX_PITCH = 0.7  # rad
 MAX_VIEWS = 12
+USUAL_DISTANCE = 1.5  # m, from which baselines are those of a room
 # How much a camera moves in x, y and z of its own axes: sideways most.
 MOTION_SHAPE = np.array([1.0, 0.6, 0.7])
 
@@ -48,7 +49,51 @@ def draw_rig(
     low, high = _free_space(room_half_size)
     centres += np.maximum(low - centres.min(axis=0), 0) - np.maximum(centres.max(axis=0) - high, 0)
 
-    distance = rng.uniform(1.0, 3.5)  # m, to the point that the views turn towards
+    # The point that the views turn towards is 1 to 3.5 m away.
+    return _views(rng, centres, offsets, turn, rng.uniform(1.0, 3.5), image_size)
+
+
+def draw_close_rig(
+    rng: np.random.Generator,
+    *,
+    target: Array,
+    distance: float,
+    yaw: float,
+    pitch: float,
+    num_views: int,
+    image_size: tuple[int, int],
+) -> PosedViews:
+    """Cameras around one that looks at a point from near by, closer together the nearer they are.
+
+    Args:
+        rng: all randomness comes from here.
+        target: ``(3,)`` world metres, about where the anchor looks.
+        distance: of the anchor from it, metres.
+        yaw: of the anchor, radians.
+        pitch: of the anchor, radians, negative looks down.
+        num_views: V, 1 to ``MAX_VIEWS``.
+        image_size: height, width.
+
+    Returns:
+        float32 views, K ``(V, 3, 3)`` and cam_from_world ``(V, 4, 4)``.
+    """
+    looks = rotation(yaw=yaw, pitch=pitch, roll=rng.normal(scale=0.1))
+    offsets = _draw_offsets(rng, num_views) * min(1.0, distance / USUAL_DISTANCE)
+    centres = target - distance * looks[:, 2] + offsets @ looks.T
+    aside = rotation(yaw=rng.normal(scale=0.1), pitch=rng.normal(scale=0.08))
+    return _views(rng, centres, offsets, looks @ aside, distance, image_size)
+
+
+def _views(
+    rng: np.random.Generator,
+    centres: Array,
+    offsets: Array,
+    turn: Array,
+    distance: float,
+    image_size: tuple[int, int],
+) -> PosedViews:
+    """Views at ``centres``, which are ``offsets`` from the anchor in its own axes."""
+    num_views = len(centres)
     cam_from_world = np.tile(np.eye(4), (num_views, 1, 1))
     for view, offset in enumerate(offsets):
         world_from_cam = turn if view == 0 else turn @ _source_turn(rng, offset, distance)

@@ -105,9 +105,17 @@ def draw_room(
     world_from_cam = views.cam_from_world.double().inverse().numpy()
     middle = np.array([0.0, -half_size[1], 0.0])
     walls = Solid(BOX, middle, half_size, np.eye(3), "plain wall")
-    groups = _furnish(rng, half_size, world_from_cam[0])
+    groups = furnish(rng, half_size, world_from_cam[0])
     centres = world_from_cam[:, :3, 3]
-    solids = [walls, *(solid for group in groups if _is_clear(group, centres) for solid in group)]
+    solids = [walls, *clear_of(groups, centres, CAMERA_CLEARANCE)]
+    return light_and_paint(rng, solids, kinds), views
+
+
+def light_and_paint(
+    rng: np.random.Generator, solids: list[Solid], kinds: Mapping[str, tuple[int, ...]]
+) -> Room:
+    """Give a lamp, surfaces and an exposure to solids, the first of which are the walls."""
+    middle, half_size = solids[0].centre, solids[0].half_size
     colour = rng.uniform(0.85, 1.15, 3)
     position = middle + rng.uniform(-0.8, 0.8, 3) * half_size
     position[1] = min(-1.6, 0.2 - 2 * half_size[1] + rng.uniform(0, 0.7))
@@ -118,7 +126,7 @@ def draw_room(
     )
     surfaces = draw_surfaces(rng, solids, kinds)
     brightness, blur = rng.uniform(0.32, 0.53), rng.uniform(0.2, 0.55)
-    return Room(_stack(solids), surfaces, light, brightness, blur), views
+    return Room(_stack(solids), surfaces, light, brightness, blur)
 
 
 def _draw_room_size(rng: np.random.Generator) -> Array:
@@ -134,18 +142,14 @@ def _draw_room_size(rng: np.random.Generator) -> Array:
     return np.array([width, rng.uniform(2.3, 3.4), depth]) / 2
 
 
-def _furnish(
-    rng: np.random.Generator, half_size: Array, world_from_cam: Array
-) -> list[list[Solid]]:
+def furnish(rng: np.random.Generator, half_size: Array, world_from_cam: Array) -> list[list[Solid]]:
     """Groups of solids in world axes, most of them where the anchor looks."""
     centre, forward = world_from_cam[:3, 3], world_from_cam[:3, 2]
     heading = np.arctan2(forward[0], forward[2])
     groups = []
 
     def place(group: list[Solid], origin: Array, turn: Array) -> None:
-        groups.append(
-            [s._replace(centre=turn @ s.centre + origin, rotation=turn @ s.rotation) for s in group]
-        )
+        groups.append(placed(group, origin, turn))
 
     for _ in range(rng.integers(3, 7)):
         spot, distance, _ = _look(centre, heading + rng.uniform(-0.65, 0.65), half_size)
@@ -188,12 +192,25 @@ def _look(centre: Array, yaw: float, half_size: Array) -> tuple[Array, float, fl
     return centre + reach[axis] * direction, float(reach[axis]), wall_yaw
 
 
-def _is_clear(group: list[Solid], cameras: Array) -> bool:
-    """No solid of the group comes near a camera, its bounding box taken for its shape."""
+def placed(group: list[Solid], origin: Array, turn: Array) -> list[Solid]:
+    """A group of furniture in world axes."""
+    return [s._replace(centre=turn @ s.centre + origin, rotation=turn @ s.rotation) for s in group]
+
+
+def clear_of(groups: list[list[Solid]], cameras: Array, clearance: float) -> list[Solid]:
+    """The solids of the groups that come nowhere near the cameras ``(V, 3)``.
+
+    Args:
+        clearance: metres, of the bounding box of every solid of a group.
+    """
+    return [solid for group in groups if _is_clear(group, cameras, clearance) for solid in group]
+
+
+def _is_clear(group: list[Solid], cameras: Array, clearance: float) -> bool:
     for solid in group:
         local = np.abs((cameras - solid.centre) @ solid.rotation)
         distance = np.linalg.norm(np.maximum(local - solid.half_size, 0), axis=-1)
-        if distance.min() < CAMERA_CLEARANCE:
+        if distance.min() < clearance:
             return False
     return True
 

@@ -31,6 +31,7 @@ def training_data(
         seed=data.seed,
         num_views=data.num_views,
         image_size=(data.height, data.width),
+        close_ups=data.close_ups,
         cache_dir=None if data.cache is None else Path(data.cache),
     )
 
