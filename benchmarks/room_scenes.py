@@ -2,6 +2,7 @@
 
     python benchmarks/room_scenes.py scannet OUT 4    # OUT/scans_test/scene0707_00, ...
     python benchmarks/room_scenes.py demon OUT 4      # OUT/room_000, ...: pairs as DPSNet has them
+    python benchmarks/room_scenes.py close-ups OUT 8  # ScanNet's layout: desks, shelves and floors
     deltas evaluate OUT --data scannet --protocol paper --views 3 --gap 2 --every 1
     deltas evaluate OUT                               # the pairs
 
@@ -19,7 +20,7 @@ from PIL import Image
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.evaluate.rooms import EVALUATION_SEEDS
 from deltas_nets.outputs.depth_formats import write_depth_png
-from deltas_nets.rooms import render_room
+from deltas_nets.rooms import render_close_up, render_room
 
 SIZE = (240, 320)
 FIRST_TEST_SCENE = 707
@@ -29,9 +30,10 @@ def main() -> None:
     layout, out, count = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     for number in range(count):
         seed = EVALUATION_SEEDS[number]
-        if layout == "scannet":
+        if layout in ("scannet", "close-ups"):
+            render = render_room if layout == "scannet" else render_close_up
             folder = out / "scans_test" / f"scene{FIRST_TEST_SCENE + number:04d}_00"
-            as_scannet(folder, render_room(seed, num_views=9, image_size=SIZE))
+            as_scannet(folder, render(seed, num_views=9, image_size=SIZE))
         else:
             as_pair(out / f"room_{number:03d}", render_room(seed, num_views=2, image_size=SIZE))
 

@@ -40,8 +40,6 @@ def draw_rig(
     Raises:
         ValueError: there is no room for so many views.
     """
-    if not 1 <= num_views <= MAX_VIEWS:
-        raise ValueError(f"num_views must be 1 to {MAX_VIEWS}, got {num_views}")
     anchor, turn = _draw_anchor(rng, room_half_size)
     offsets = _draw_offsets(rng, num_views)
     # Where a wall is in the way, the whole rig moves; its baselines stay.
@@ -76,6 +74,9 @@ def draw_close_rig(
 
     Returns:
         float32 views, K ``(V, 3, 3)`` and cam_from_world ``(V, 4, 4)``.
+
+    Raises:
+        ValueError: there is no room for so many views.
     """
     looks = rotation(yaw=yaw, pitch=pitch, roll=rng.normal(scale=0.1))
     offsets = _draw_offsets(rng, num_views) * min(1.0, distance / USUAL_DISTANCE)
@@ -138,6 +139,8 @@ def _draw_offsets(rng: np.random.Generator, num_views: int) -> Array:
     A third of the rigs are in line, evenly spaced like a tracking shot or a stereo rig;
     the others are scattered.
     """
+    if not 1 <= num_views <= MAX_VIEWS:
+        raise ValueError(f"num_views must be 1 to {MAX_VIEWS}, got {num_views}")
     if rng.random() < 0.35:
         # With many views the whole line may be longer than one good baseline.
         step = rng.uniform(0.05, min(0.3, 0.75 / max(num_views - 1, 1)))

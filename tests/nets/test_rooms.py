@@ -1,5 +1,6 @@
 """Drawn rooms: shapes, reproducibility, and geometry that all views agree on."""
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from torch.utils.data import DataLoader, default_collate
 from deltas_geom.cameras.projection import project, unproject
 from deltas_geom.cameras.views import PosedViews
 from deltas_nets.captures.posed_images import PosedImages
-from deltas_nets.rooms import Rooms, draw_room, render_room, texture_atlas
+from deltas_nets.rooms import Rooms, draw_room, render_close_up, render_room, texture_atlas
 from deltas_nets.rooms.cast import cast_rays
+from deltas_nets.rooms.enlarged import as_large_as_rooms
 from deltas_nets.rooms.furniture import BOX, CYLINDER, ELLIPSOID
 from deltas_nets.rooms.materials import Surfaces
 from deltas_nets.rooms.render import _mirror_image, render_view
@@ -32,9 +34,14 @@ SIZE = (72, 96)
 SEEDS = range(4)
 
 
+@pytest.fixture(scope="module", params=[render_room, render_close_up])
+def render(request: pytest.FixtureRequest) -> Callable[..., PosedImages]:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def rooms() -> list[PosedImages]:
-    return [render_room(seed, num_views=3, image_size=SIZE) for seed in SEEDS]
+def rooms(render: Callable[..., PosedImages]) -> list[PosedImages]:
+    return [render(seed, num_views=3, image_size=SIZE) for seed in SEEDS]
 
 
 # Shapes and values
@@ -51,7 +58,15 @@ def test_an_item_has_the_shapes_and_types_it_promises(rooms: list[PosedImages]) 
 def test_every_pixel_has_a_depth_within_a_house(rooms: list[PosedImages]) -> None:
     depth = torch.stack([room.depth for room in rooms])
     assert depth.isfinite().all()
-    assert depth.min() > 0.2 and depth.max() < 14  # m
+    assert depth.min() > 0.1 and depth.max() < 14  # m
+
+
+def test_close_ups_are_closer_than_rooms() -> None:
+    def median(render: Callable[..., PosedImages]) -> float:
+        depths = [render(seed, num_views=1, image_size=SIZE).depth.median() for seed in range(12)]
+        return float(torch.stack(depths).median())
+
+    assert 0.3 < median(render_close_up) < 1.2 < median(render_room)  # m
 
 
 def test_exposure_aims_at_a_mean_brightness(rooms: list[PosedImages]) -> None:
@@ -73,19 +88,23 @@ def test_cameras_are_rigid_apart_and_of_the_promised_focal_length() -> None:
 
 
 @pytest.mark.parametrize("num_views", [0, 13])
-def test_a_rig_of_no_or_too_many_views_is_an_error(num_views: int) -> None:
+def test_a_rig_of_no_or_too_many_views_is_an_error(
+    num_views: int, render: Callable[..., PosedImages]
+) -> None:
     with pytest.raises(ValueError, match=f"num_views must be 1 to 12, got {num_views}"):
-        render_room(0, num_views=num_views, image_size=SIZE)
+        render(0, num_views=num_views, image_size=SIZE)
 
 
 # Reproducibility
 
 
-def test_a_seed_gives_the_same_room_whatever_was_drawn_before(rooms: list[PosedImages]) -> None:
+def test_a_seed_gives_the_same_room_whatever_was_drawn_before(
+    rooms: list[PosedImages], render: Callable[..., PosedImages]
+) -> None:
     torch.manual_seed(1)
     np.random.seed(1)  # noqa: NPY002 - the global generator is what must not matter
     before = torch.get_rng_state()
-    assert_same(render_room(2, num_views=3, image_size=SIZE), rooms[2])
+    assert_same(render(2, num_views=3, image_size=SIZE), rooms[2])
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -345,6 +364,30 @@ def test_a_cached_room_is_the_rendered_room(tmp_path: Path) -> None:
     assert [path.suffix for path in (tmp_path / "cache").iterdir()] == [".safetensors"]
     other = Rooms(2, seed=5, num_views=3, image_size=SIZE, cache_dir=tmp_path / "cache")
     assert other[1].images.shape[0] == 3  # not the file of two views
+
+
+def test_close_ups_are_some_of_the_rooms_and_as_large_as_the_others(tmp_path: Path) -> None:
+    rooms = Rooms(
+        30, seed=5, num_views=1, image_size=(24, 32), close_ups=0.5, cache_dir=tmp_path / "cache"
+    )
+    medians = [float(room.depth.median()) for room in rooms]
+    names = [path.name.split("-v")[0] for path in (tmp_path / "cache").iterdir()]
+    assert 8 <= names.count("close-up") <= 22 and names.count("room") == 30 - names.count(
+        "close-up"
+    )
+    assert min(medians) >= 1.0 and max(medians) <= 10.0
+    assert [float(room.depth.median()) for room in rooms] == medians  # read as they were rendered
+
+
+def test_an_enlarged_scene_looks_the_same() -> None:
+    desk = render_close_up(1, num_views=2, image_size=SIZE)  # median 0.8 m
+    enlarged = as_large_as_rooms(desk, 7)
+    larger = enlarged.depth.median() / desk.depth.median()
+    assert larger > 1.5
+    for before, after in zip(
+        compare(desk, anchor=0, source=1), compare(enlarged, anchor=0, source=1), strict=True
+    ):
+        assert_close(before.float(), after.float(), rtol=0, atol=0.02)
 
 
 def test_rooms_batch_like_any_data_set() -> None:
