@@ -14,7 +14,8 @@ def _loss(function: str, ours: float, *, paper: float = 0.0) -> Any:
     """A row of the table.
 
     Args:
-        function: "module:name" in `deltas_nets.losses`; it takes a `Seen` and returns a scalar.
+        function: "module:name" in `deltas_nets.losses`; it takes a `Seen`, or of dense
+            a `SeenMap`, and returns a scalar.
         ours: the weight in our trainings, unless a flag gives another.
         paper: the weight in the paper's; 0 where the paper has no such term.
     """
@@ -54,6 +55,9 @@ _ROWS = {row.name: row.metadata for row in fields(LossConfig) if "function" in r
 
 LOSS_FUNCTIONS: dict[str, str] = {name: row["function"] for name, row in _ROWS.items()}
 """The function of each loss, in the order in which losses are recorded."""
+
+MAP_TERMS = tuple(name for name, row in _ROWS.items() if row["function"].startswith("dense:"))
+"""Those that look at nothing but the dense map: each takes a `SeenMap`."""
 
 PAPER_LOSS = LossConfig(**{name: row["paper"] for name, row in _ROWS.items()})
 """The five terms with the paper's weights, and no other."""

@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.config.checks import check_at_least, check_positive, check_seed
-from deltas_nets.config.training import DataConfig, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -19,75 +18,56 @@ class RedrawConfig:
     init: str = "deltas-small"
     """The network that it is for, and whose own densifier or stage that redraws it starts from: a
     shipped one, or a weights file of `deltas train`."""
-    steps: int = 1500
+    steps: int = 600
     """Optimiser steps."""
     batch_size: int = 4
-    """Rooms per step; each is seen in four steps or so."""
-    learning_rate: float = 3e-4
+    """Views per step, of as many rooms."""
+    learning_rate: float = 4e-4
     """Peak; it falls to a hundredth along half a cosine."""
-    sizes: tuple[tuple[int, int], ...] = ((240, 320), (240, 320), (240, 320), (288, 384))
-    """(height, width) of the images of a step, drawn at random."""
-    num_views: int = 3
-    """Views of the maps that err as those do which are to be drawn anew."""
-    num_keypoints: int = 640
-    """Points of these maps."""
-    num_rooms: int = 5000
-    """Rooms in an epoch."""
+    sizes: tuple[tuple[int, int], ...] = ((288, 384), (240, 320))
+    """(height, width) of the images of a step, drawn at random; rooms have the largest of them."""
+    num_rooms: int = 300
+    """Rooms, each made once: twelve seconds of a processor."""
+    num_views: int = 10
+    """Views of a room, whose maps hear each other."""
+    num_sources: int = 2
+    """Other views that a map is made from."""
+    close_ups: float = 0.3
+    """Share of the rooms that are desks, shelves and floors from near by."""
     first_room: int = 300_000
     """Seed of the first room."""
     save_every: int = 100
     """Steps after which --out is written anew, with what is there by then."""
     workers: int = 1
-    """Processes that render."""
+    """Processes that make rooms; 0 does it in the training process."""
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder that keeps rendered rooms; without it they are rendered."""
+    """Folder that keeps the rooms and the network's maps of them, 15 MB each, for other trainings
+    of the same network; without it they are gone afterwards."""
     log: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Gets a line of JSON for every 20 steps."""
     seed: int = 0
     """Of everything random."""
 
     def __post_init__(self) -> None:
-        check_at_least(1, self, "steps", "save_every")
+        check_at_least(1, self, "steps", "save_every", "batch_size", "num_rooms", "num_sources")
         check_at_least(0, self, "workers")
-        check_at_least(2, self, "num_views")
-        check_at_least(8, self, "num_keypoints")
         check_positive(self, "learning_rate")
         check_seed(self)
-        if self.batch_size < REPLAY or self.batch_size % REPLAY:
-            raise ValueError(f"batch_size must be a multiple of {REPLAY}, got {self.batch_size}")
-        for size in self.sizes:
-            if min(size) < 32:
-                raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {size}")
+        if not self.num_sources < self.num_views <= MOST_VIEWS:
+            raise ValueError(
+                f"num_views must be above num_sources and at most {MOST_VIEWS}, got "
+                f"{self.num_views} and {self.num_sources}"
+            )
+        if not 0 <= self.close_ups <= 1:
+            raise ValueError(f"close_ups must be within [0, 1], got {self.close_ups}")
+        if not self.sizes or min(map(min, self.sizes)) < 32:
+            raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {self.sizes}")
         if self.first_room < VALIDATED:
             what = f"first_room must be {VALIDATED} or more, as no training sees those below"
             raise ValueError(f"{what}; got {self.first_room}")
-        self.of_rooms()
-
-    def of_rooms(self) -> TrainConfig:
-        """How rooms are rendered and seen."""
-        data = DataConfig(
-            num_rooms=self.num_rooms,
-            seed=self.first_room,
-            num_views=self.num_views + 2,
-            height=max(height for height, _ in self.sizes),
-            width=max(width for _, width in self.sizes),
-            cache=None if self.cache is None else str(self.cache),
-            workers=self.workers,
-            replay=REPLAY,
-            shelf=10,
-        )
-        return TrainConfig(
-            data=data,
-            steps=self.steps,
-            sizes=self.sizes,
-            batch_size=self.batch_size,
-            min_views=self.num_views,
-            max_views=self.num_views,
-            seed=self.seed,
-        )
 
 
-REPLAY = 4
-"""Steps in which a rendered room is seen."""
+MOST_VIEWS = 12
+"""Of a room."""
 VALIDATED = 1000
 """Seeds below are those of rooms that are measured on."""

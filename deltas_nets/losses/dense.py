@@ -10,19 +10,19 @@ from kornia.losses import inverse_depth_smoothness_loss
 from torch import Tensor
 
 from deltas_nets.losses.divisors import Divisors
-from deltas_nets.losses.seen import Seen, masked_mean
+from deltas_nets.losses.seen import SeenMap, masked_mean
 from deltas_nets.network.layers import upsample_like
 
 
-def smoothness_loss(seen: Seen) -> Tensor:
+def smoothness_loss(seen: SeenMap) -> Tensor:
     """Edge-aware smoothness of inverse depth, relative to its mean (paper: L_sm)."""
-    inverse = 1 / seen.prediction.depth
+    inverse = (-seen.dense.log_depth[0]).exp()
     relative = inverse / inverse.mean(dim=(-2, -1), keepdim=True).detach()
     loss: Tensor = inverse_depth_smoothness_loss(relative, seen.image.to(relative.dtype))
     return loss
 
 
-def depth_loss(seen: Seen) -> Tensor:
+def depth_loss(seen: SeenMap) -> Tensor:
     """Smooth L1 of log depth over four scales (paper: L_d).
 
     The first scale has the image's resolution; the others are compared with the mean of the log
@@ -36,7 +36,7 @@ def depth_loss(seen: Seen) -> Tensor:
     return loss
 
 
-def gradient_loss(seen: Seen) -> Tensor:
+def gradient_loss(seen: SeenMap) -> Tensor:
     """L1 of the gradient of log depth at the two finest scales."""
     loss = seen.depth.new_zeros(())
     for scale, predicted in enumerate(seen.dense.log_depth[:2]):
@@ -46,7 +46,7 @@ def gradient_loss(seen: Seen) -> Tensor:
     return loss
 
 
-def spread_loss(seen: Seen) -> Tensor:
+def spread_loss(seen: SeenMap) -> Tensor:
     """Laplace negative log likelihood of the dense map's error under its own spread.
 
     The error is a constant here: doubt must not become a way to lower the depth loss.
@@ -58,7 +58,7 @@ def spread_loss(seen: Seen) -> Tensor:
     return masked_mean(error * (-log_spread).exp() + log_spread, known, seen.divisors)
 
 
-def _log_depth_like(predicted: Tensor, seen: Seen) -> tuple[Tensor, Tensor]:
+def _log_depth_like(predicted: Tensor, seen: SeenMap) -> tuple[Tensor, Tensor]:
     """The true log depth at a scale of the dense map, and where it is known."""
     known = _known(seen)
     truth = torch.where(known, seen.depth, 1.0).log()
@@ -83,6 +83,6 @@ def _gradient_difference(
     return across + down
 
 
-def _known(seen: Seen) -> Tensor:
+def _known(seen: SeenMap) -> Tensor:
     near, far = seen.depth_range
     return (seen.depth > 0.8 * near) & (seen.depth < 1.2 * far)

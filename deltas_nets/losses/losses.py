@@ -5,16 +5,17 @@ Which there are, and what they weigh, is in the table of `deltas_nets.config.los
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from deltas_geom import PosedViews
-from deltas_nets.config import LOSS_FUNCTIONS, LossConfig
+from deltas_nets.config import LOSS_FUNCTIONS, MAP_TERMS, LossConfig
 from deltas_nets.config.lookup import look_up
 from deltas_nets.losses.divisors import WHOLE, Divisors
-from deltas_nets.losses.seen import Seen
+from deltas_nets.losses.seen import MapAlone, Seen
 from deltas_nets.losses.targets import detector_labels, keypoint_targets
+from deltas_nets.network.lite.densifier import DenseDepth
 from deltas_nets.network.origin import moved_to_anchor
 from deltas_nets.network.prediction import DepthPrediction
 
@@ -32,7 +33,7 @@ class Losses(NamedTuple):
 
 
 @cache
-def loss_functions() -> dict[str, Callable[[Seen], Tensor]]:
+def loss_functions() -> dict[str, Callable[[Any], Tensor]]:
     """The functions that the table names."""
     return {name: look_up("deltas_nets.losses", place) for name, place in LOSS_FUNCTIONS.items()}
 
@@ -76,5 +77,31 @@ def training_losses(
         divisors,
     )
     terms = {name: term(seen) for name, term in loss_functions().items()}
+    return _weighed(terms, config, depth)
+
+
+def map_losses(
+    dense: DenseDepth,
+    images: Tensor,
+    depth: Tensor,
+    config: LossConfig,
+    *,
+    depth_range: tuple[float, float],
+) -> Losses:
+    """The terms of dense maps alone.
+
+    Args:
+        dense: maps of B images.
+        images: ``(B, 3, H, W)`` as the network saw them.
+        depth: ``(B, 1, H, W)`` metres, 0 = unknown.
+        config: weights of the terms.
+        depth_range: within which the truth counts.
+    """
+    seen = MapAlone(dense, images, depth, depth_range, config.scale_decay)
+    terms = {name: loss_functions()[name](seen) for name in MAP_TERMS}
+    return _weighed(terms, config, depth)
+
+
+def _weighed(terms: dict[str, Tensor], config: LossConfig, like: Tensor) -> Losses:
     weighted = (getattr(config, name) * term for name, term in terms.items())
-    return Losses(terms, sum(weighted, depth.new_zeros(())))
+    return Losses(terms, sum(weighted, like.new_zeros(())))

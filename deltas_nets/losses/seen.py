@@ -11,6 +11,17 @@ from deltas_nets.network.lite.densifier import DenseDepth
 from deltas_nets.network.prediction import DepthPrediction
 
 
+class MapAlone(NamedTuple):
+    """A map that no points come with; the fields are those of :class:`Seen`."""
+
+    dense: DenseDepth
+    image: Tensor
+    depth: Tensor
+    depth_range: tuple[float, float]
+    decay: float
+    divisors: Divisors = WHOLE
+
+
 class Seen(NamedTuple):
     """What a term may look at.
 
@@ -40,6 +51,10 @@ class Seen(NamedTuple):
     def dense(self) -> DenseDepth:
         """The dense map at all its scales."""
         return self.prediction.evidence.dense
+
+
+SeenMap = Seen | MapAlone
+"""What a term of the dense map looks at."""
 
 
 def masked_mean(values: Tensor, mask: Tensor, divisors: Divisors = WHOLE) -> Tensor:

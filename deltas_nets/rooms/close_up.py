@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 CLEARANCE = 0.15  # m, nothing is nearer to a camera
 SUBJECTS = (close_things.desk, close_things.desk, close_things.bins, close_things.floor_things)
+DISTANCES = (0.4, 1.8)  # m, to what the cameras look at
+TO_CAMERA = 0.4  # m, from walls, floor and ceiling
+TRIES = 20
 TO_WALL = 0.05  # m, from the back of a desk or a shelf
 
 
@@ -68,21 +71,21 @@ def _look_at(
     """A rig that looks at one of the subject's solids; ``upright`` ones from in front."""
     target = subject[rng.integers(len(subject))].centre + rng.normal(scale=0.05, size=3)
     down = (-0.25, 0.5) if upright else (0.15, 1.2)
-    for _ in range(100):
-        distance = float(np.exp(rng.uniform(np.log(0.4), np.log(1.8))))
-        yaw, pitch = rng.uniform(-0.8, 0.8), -rng.uniform(*down)
-        centre = target - distance * rotation(yaw=yaw, pitch=pitch)[:, 2]
-        inside = np.abs(centre - (0, -half_size[1], 0)) < half_size - 0.4
-        if inside.all():
+    middle = np.array([0.0, -half_size[1], 0.0])
+    free = half_size - TO_CAMERA
+    centre = middle
+    for _ in range(TRIES):
+        distance = np.exp(rng.uniform(*np.log(DISTANCES)))
+        looks = rotation(yaw=rng.uniform(-0.8, 0.8), pitch=-rng.uniform(*down))[:, 2]
+        tried = np.clip(target - distance * looks, middle - free, middle + free)
+        if np.linalg.norm(target - tried) > DISTANCES[0]:
+            centre = tried
             break
-    else:
-        raise AssertionError(f"no place to look at {target} from in a room of {half_size}")
     return draw_close_rig(
         rng,
         target=target,
-        distance=distance,
-        yaw=float(yaw),
-        pitch=float(pitch),
+        centre=centre,
+        room_half_size=half_size,
         num_views=num_views,
         image_size=image_size,
     )

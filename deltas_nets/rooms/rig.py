@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 FOCAL_RANGE = (0.75, 1.45)  # of the image width
 BASELINE_RANGE = (0.03, 0.6)  # m, between any two views of one rig
 WALL_MARGIN = 0.4  # m, no camera comes nearer to a wall, the floor or the ceiling
+CLOSE_MARGIN = 0.12  # m, the same where cameras are close to things
 MAX_PITCH = 0.7  # rad
 MAX_VIEWS = 12
 USUAL_DISTANCE = 1.5  # m, from which baselines are those of a room
@@ -42,10 +43,7 @@ def draw_rig(
     """
     anchor, turn = _draw_anchor(rng, room_half_size)
     offsets = _draw_offsets(rng, num_views)
-    # Where a wall is in the way, the whole rig moves; its baselines stay.
-    centres = anchor + offsets @ turn.T
-    low, high = _free_space(room_half_size)
-    centres += np.maximum(low - centres.min(axis=0), 0) - np.maximum(centres.max(axis=0) - high, 0)
+    centres = _inside(anchor + offsets @ turn.T, room_half_size, WALL_MARGIN)
 
     # The point that the views turn towards is 1 to 3.5 m away.
     return _views(rng, centres, offsets, turn, rng.uniform(1.0, 3.5), image_size)
@@ -55,9 +53,8 @@ def draw_close_rig(
     rng: np.random.Generator,
     *,
     target: Array,
-    distance: float,
-    yaw: float,
-    pitch: float,
+    centre: Array,
+    room_half_size: Array,
     num_views: int,
     image_size: tuple[int, int],
 ) -> PosedViews:
@@ -66,9 +63,8 @@ def draw_close_rig(
     Args:
         rng: all randomness comes from here.
         target: ``(3,)`` world metres, about where the anchor looks.
-        distance: of the anchor from it, metres.
-        yaw: of the anchor, radians.
-        pitch: of the anchor, radians, negative looks down.
+        centre: ``(3,)`` world metres, about where it is.
+        room_half_size: ``(3,)`` metres, as for :func:`draw_rig`.
         num_views: V, 1 to ``MAX_VIEWS``.
         image_size: height, width.
 
@@ -78,9 +74,12 @@ def draw_close_rig(
     Raises:
         ValueError: there is no room for so many views.
     """
+    x, y, z = target - centre
+    distance = float(np.linalg.norm((x, y, z)))
+    yaw, pitch = float(np.arctan2(x, z)), float(-np.arcsin(y / distance))
     looks = rotation(yaw=yaw, pitch=pitch, roll=rng.normal(scale=0.1))
     offsets = _draw_offsets(rng, num_views) * min(1.0, distance / USUAL_DISTANCE)
-    centres = target - distance * looks[:, 2] + offsets @ looks.T
+    centres = _inside(centre + offsets @ looks.T, room_half_size, CLOSE_MARGIN)
     aside = rotation(yaw=rng.normal(scale=0.1), pitch=rng.normal(scale=0.08))
     return _views(rng, centres, offsets, looks @ aside, distance, image_size)
 
@@ -115,7 +114,7 @@ def _draw_intrinsics(rng: np.random.Generator, image_size: tuple[int, int]) -> A
 
 def _draw_anchor(rng: np.random.Generator, room_half_size: Array) -> tuple[Array, Array]:
     """Centre ``(3,)`` and world_from_cam rotation ``(3, 3)`` of view 0."""
-    low, high = _free_space(room_half_size)
+    low, high = _free_space(room_half_size, WALL_MARGIN)
     centre = rng.uniform(low, high)
     # Standing or sitting people: the head is 0.8 to 1.9 m above the floor.
     centre[1] = np.clip(-rng.uniform(0.8, 1.9), low[1], high[1])
@@ -178,8 +177,19 @@ def _source_turn(rng: np.random.Generator, offset: Array, distance: float) -> Ar
     return rotation(yaw=yaw, pitch=pitch, roll=rng.normal(scale=0.035 * loose))
 
 
-def _free_space(room_half_size: Array) -> tuple[Array, Array]:
+def _inside(centres: Array, room_half_size: Array, margin: float) -> Array:
+    """Where a wall is in the way, the whole rig moves; its baselines stay."""
+    low, high = _free_space(room_half_size, margin)
+    moved: Array = (
+        centres
+        + np.maximum(low - centres.min(axis=0), 0)
+        - np.maximum(centres.max(axis=0) - high, 0)
+    )
+    return moved
+
+
+def _free_space(room_half_size: Array, margin: float) -> tuple[Array, Array]:
     """Lowest and highest camera centre, ``(3,)`` each."""
-    half = room_half_size - WALL_MARGIN
+    half = room_half_size - margin
     middle = np.array([0, -room_half_size[1], 0])
     return middle - half, middle + half

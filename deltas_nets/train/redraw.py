@@ -1,34 +1,38 @@
 """Train the stage that redraws; nothing else of the network changes.
 
-The network makes maps of rooms. They become maps as several frames would have agreed on, and the
-stage learns to draw them as the rooms are. The command is `deltas redraw`.
+The network makes maps of rooms, and they hear each other as those of a capture do. The stage learns
+to draw them as the rooms are. The command is `deltas redraw`.
 """
 
+import copy
 import json
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+from torch.utils.data import DataLoader
 
 from deltas_nets.config import LossConfig
 from deltas_nets.config.redraw import RedrawConfig
 from deltas_nets.config.schedule import rate_factor
-from deltas_nets.datasets.agreed_maps import agreed_like
+from deltas_nets.datasets.workers import leave_to_the_parent
 from deltas_nets.errors import UserError
-from deltas_nets.losses.losses import training_losses
+from deltas_nets.evaluate.rooms import DisturbedRooms
+from deltas_nets.losses.losses import map_losses
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.network.encoded import Encoded
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.lite.redraw import Redraw
-from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.outputs.atomic_files import check_writable
+from deltas_nets.rooms import Rooms
 from deltas_nets.train.average import RunningAverage
-from deltas_nets.train.batches import Batch, BatchMaker
-from deltas_nets.train.loader import room_loader
+from deltas_nets.train.heard_rooms import HeardRooms
 from deltas_nets.train.step import DEPTH_RANGE
 from deltas_nets.weights_file import (
     check_new_weights,
@@ -38,9 +42,9 @@ from deltas_nets.weights_file import (
     weights_file,
 )
 
-__all__ = ["RedrawConfig", "learns", "train_redraw", "with_redraw"]
+__all__ = ["Lesson", "RedrawConfig", "learns", "lesson", "train_redraw", "with_redraw"]
 
-LOSS = LossConfig(detector=0, match=0, point=0, posterior=0, confidence=0, spread=0)
+LOSS = LossConfig(spread=0)
 """Of the map alone; the deviation stays that of the agreement."""
 AVERAGE, WARMUP, CLIP = 0.98, 20, 1.0
 LOGGED = 20
@@ -51,19 +55,17 @@ _PLACES = ("out", "init", "cache", "log", "workers", "save_every")
 
 
 class Lesson(NamedTuple):
-    """A step's rooms.
+    """Views of a step, of several rooms.
 
     Attributes:
-        batch: images and truth.
-        encoded: of the network.
-        prediction: its own, of which the lessons are made.
+        images: ``(B, 3, H, W)`` in [0, 1].
         agreed: ``(B, 1, H, W)`` the maps that are to be drawn anew.
+        depth: ``(B, 1, H, W)`` true, metres.
     """
 
-    batch: Batch
-    encoded: Encoded
-    prediction: DepthPrediction
+    images: Tensor
     agreed: KnownDepth
+    depth: Tensor
 
 
 def train_redraw(
@@ -79,7 +81,7 @@ def train_redraw(
         config: what to do.
         device: where to compute.
         overwrite: replace ``config.out`` if it exists.
-        report: called after every step.
+        report: called after every room and every step.
 
     Returns:
         The weights file.
@@ -94,13 +96,35 @@ def train_redraw(
     model = with_redraw(load_model(config.init).to(device), weights_file(config.init))
     assert model.redraw is not None
     before = read_metadata(weights_file(config.init))
+    with tempfile.TemporaryDirectory() as temporary:
+        heard = heard_rooms(model, config, config.cache or Path(temporary))
+        for index in DataLoader(
+            heard,
+            batch_size=None,
+            num_workers=config.workers,
+            worker_init_fn=leave_to_the_parent,
+        ):
+            report(f"room {index + 1} of {config.num_rooms}")
+        _learn(model, heard, config, device, before, report)
+    return config.out
+
+
+def _learn(
+    model: Deltas,
+    heard: HeardRooms,
+    config: RedrawConfig,
+    device: str | torch.device,
+    before: dict[str, str],
+    report: Callable[[str], None],
+) -> None:
+    assert model.redraw is not None
     average = RunningAverage(model, AVERAGE)
     optimizer = torch.optim.AdamW(model.redraw.parameters(), weight_decay=1e-4)
-    for step, lesson in enumerate(lessons(model, config, device)):
+    for step in range(config.steps):
         rate = config.learning_rate * rate_factor(step, config.steps, warmup=WARMUP)
         for group in optimizer.param_groups:
             group["lr"] = rate
-        said = learns(model, lesson, optimizer)
+        said = learns(model, lesson(heard, config, step, device), optimizer)
         average.update(model, step)
         _note(config, step, said)
         done = step + 1
@@ -110,7 +134,20 @@ def train_redraw(
             assert isinstance(averaged, Deltas)
             save_weights(config.out, averaged, record_of(config, before, done))
         report(f"step {done} of {config.steps}")
-    return config.out
+
+
+def heard_rooms(model: Deltas, config: RedrawConfig, folder: Path) -> HeardRooms:
+    """The rooms that a training learns from, whose files are in a folder; made on the host."""
+    height, width = (max(side) for side in zip(*config.sizes, strict=True))
+    rooms = Rooms(
+        config.num_rooms,
+        seed=config.first_room,
+        num_views=config.num_views,
+        image_size=(height, width),
+        close_ups=config.close_ups,
+    )
+    on_host = copy.deepcopy(model).cpu()  # its processes cannot share another device
+    return HeardRooms(DisturbedRooms(rooms), on_host, folder, num_sources=config.num_sources)
 
 
 def with_redraw(model: Deltas, source: Path) -> Deltas:
@@ -134,60 +171,43 @@ def with_redraw(model: Deltas, source: Path) -> Deltas:
     return model
 
 
-@torch.no_grad()
-def _lesson(model: Deltas, batch: Batch, config: RedrawConfig, step: int) -> Lesson:
-    encoded = model.encode(batch.images)
-    size = (batch.images.shape[-2], batch.images.shape[-1])
-    prediction = model.from_encoded(
-        encoded,
-        batch.views,
-        DEPTH_RANGE,
-        image_size=size,
-        num_keypoints=config.num_keypoints,
-        shift=batch.shift,
+def lesson(
+    heard: HeardRooms, config: RedrawConfig, step: int, device: str | torch.device = "cpu"
+) -> Lesson:
+    """What a step learns from: views of rooms drawn by chance, half of them mirrored."""
+    random = np.random.default_rng((config.seed, step))
+    height, width = config.sizes[random.integers(len(config.sizes))]
+    drawn = []
+    for room in random.integers(config.num_rooms, size=config.batch_size):
+        view = heard.view(int(room), int(random.integers(config.num_views)))
+        parts = (view.image, *view.agreed, view.depth)
+        drawn.append([part.flip(-1) for part in parts] if random.random() < 0.5 else parts)
+    image, *maps = (torch.stack(parts).to(device) for parts in zip(*drawn, strict=True))
+    image = F.interpolate(image, size=(height, width), mode="bilinear", antialias=True)
+    depth, deviation, truth = (
+        F.interpolate(part, size=(height, width), mode="nearest-exact") for part in maps
     )
-    own = KnownDepth(prediction.depth, prediction.std / prediction.depth)
-    random = torch.Generator().manual_seed(1_000_003 * config.seed + step)
-    return Lesson(batch, encoded, prediction, agreed_like(own, batch.depth[:, :1], random))
-
-
-def lessons(
-    model: Deltas, config: RedrawConfig, device: str | torch.device = "cpu"
-) -> Iterator[Lesson]:
-    """What each step learns from."""
-    of_rooms = config.of_rooms()
-    make = BatchMaker(of_rooms)
-    for step, rooms in enumerate(room_loader(of_rooms, start=0, stop=config.steps)):
-        on_device = rooms.map(lambda tensor: tensor.to(device))
-        yield _lesson(model, make(on_device, step), config, step)
+    return Lesson(image, KnownDepth(depth, deviation), truth)
 
 
 def learns(model: Deltas, lesson: Lesson, optimizer: torch.optim.Optimizer) -> dict[str, float]:
     """A step; what the maps' relative error was before and after they were drawn anew."""
-    batch, encoded, prediction, agreed = lesson
+    images, agreed, truth = lesson
     assert model.redraw is not None
-    drawn = model.redraw(encoded.features, agreed)
-    depth = drawn.log_depth[0].exp()
-    evidence = prediction.evidence._replace(dense=drawn)
-    losses = training_losses(
-        prediction._replace(depth=depth, evidence=evidence),
-        batch.images,
-        batch.true_views,
-        batch.depth,
-        LOSS,
-        depth_range=DEPTH_RANGE,
-    )
+    with torch.no_grad():
+        features = model.encode(images[:, None]).features
+    drawn = model.redraw(features, agreed)
+    losses = map_losses(drawn, images, truth, LOSS, depth_range=DEPTH_RANGE)
     optimizer.zero_grad()
     losses.total.backward()  # type: ignore[no-untyped-call]
     norm = torch.nn.utils.clip_grad_norm_(model.redraw.parameters(), CLIP)
     if bool(norm.isfinite()):  # a bad batch must not end a training
         optimizer.step()
-    truth = batch.depth[:, :1]
     return {
         "loss": float(losses.total.detach()),
         "gradient": float(losses.terms["gradient"].detach()),
         "abs_rel_agreed": _abs_rel(agreed.depth, truth),
-        "abs_rel_redrawn": _abs_rel(depth.detach(), truth),
+        "abs_rel_redrawn": _abs_rel(drawn.log_depth[0].detach().exp(), truth),
     }
 
 

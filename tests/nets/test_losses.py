@@ -25,7 +25,7 @@ from deltas_nets.config import (
 from deltas_nets.losses.dense import depth_loss, gradient_loss, smoothness_loss, spread_loss
 from deltas_nets.losses.losses import loss_functions, training_losses
 from deltas_nets.losses.points import confidence_loss, match_loss, point_loss, posterior_loss
-from deltas_nets.losses.seen import Seen
+from deltas_nets.losses.seen import MapAlone, Seen
 from deltas_nets.losses.targets import Targets, detector_labels, keypoint_targets
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.densifier import DenseDepth
@@ -170,8 +170,8 @@ def test_smoothness_is_kornias_of_relative_inverse_depth(seen: Seen) -> None:
         inverse / inverse.mean(dim=(2, 3), keepdim=True), image
     )
     for factor in (1, 5):
-        prediction = seen.prediction._replace(depth=factor * depth)
-        found = smoothness_loss(seen._replace(prediction=prediction, image=image))
+        dense = seen.dense._replace(log_depth=((factor * depth).log(),))
+        found = smoothness_loss(MapAlone(dense, image, depth, RANGE, 1.0))
         torch.testing.assert_close(found, expected)
 
 
