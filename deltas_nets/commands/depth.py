@@ -225,7 +225,7 @@ class Depth(Captured, Measuring, Prediction):
 
         from deltas_nets.captures.ids import id_in_json
         from deltas_nets.outputs.depth_formats import MILLIMETRES
-        from deltas_nets.outputs.folder import prepare_output
+        from deltas_nets.outputs.prepare import prepare_output
         from deltas_nets.outputs.summary import FORMAT, SCALE, view_sets_in_json
 
         predict = to_dict(config)

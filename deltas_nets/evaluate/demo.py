@@ -18,7 +18,7 @@ from deltas_nets.evaluate.figure import draw_prediction
 from deltas_nets.evaluate.points import median_point_error, score_points
 from deltas_nets.evaluate.report import metrics_table
 from deltas_nets.network.deltas import Deltas
-from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.encoded_frames import EncodedFrames

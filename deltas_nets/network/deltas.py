@@ -212,15 +212,14 @@ class Deltas(nn.Module):
         dense = self.densifier(encoded.features, sparse)
         depth = dense.log_depth[0].exp()
         size = (sparse.depth.shape[-2], sparse.depth.shape[-1])
-        # A Laplace distribution deviates by sqrt(2) of its scale.
-        log_std = upsample_to(dense.log_spread, size) + 0.5 * math.log(2)
+        log_std = upsample_to(_log_deviation(dense), size)
         return Densified(dense, depth, self.calibration(log_std, num_views).exp() * depth)
 
     def redrawn(self, encoded: Encoded, agreed: KnownDepth) -> KnownDepth:
         """A map that several frames agreed on, with the edges that the image shows.
 
-        Its deviation stays. Without a stage that redraws, as in networks of which `deltas redraw`
-        trained none, so does its depth.
+        Without a stage that redraws, as in networks of which `deltas redraw` trained none, it stays
+        as it is.
 
         Args:
             encoded: the anchor, or a view set whose first view it is, of B images.
@@ -228,7 +227,8 @@ class Deltas(nn.Module):
         """
         if self.redraw is None:
             return agreed
-        return agreed._replace(depth=self.redraw(encoded.features, agreed).log_depth[0].exp())
+        drawn = self.redraw(encoded.features, agreed)
+        return KnownDepth(drawn.log_depth[0].exp(), _log_deviation(drawn).exp())
 
     def complete(self, encoded: Encoded, known: KnownDepth) -> Densified:
         """A map of one image and depth that is known of it; no other view is looked at.
@@ -242,6 +242,12 @@ class Deltas(nn.Module):
         nothing = SparseDepth(*(torch.zeros_like(part) for part in known))
         believed = reconciled(nothing, known, first.dense.log_depth[0])
         return self.densified(encoded, believed, num_views=2)
+
+
+def _log_deviation(dense: DenseDepth) -> Tensor:
+    """Of the log of depth, at the resolution of its spread, before calibration."""
+    # A Laplace distribution deviates by sqrt(2) of its scale.
+    return dense.log_spread + 0.5 * math.log(2)
 
 
 def _flat_maps(known: KnownDepth) -> KnownDepth:

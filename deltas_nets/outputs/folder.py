@@ -9,47 +9,23 @@ fill one folder; each keeps its own summary.I-of-N.json beside the summary of al
 that it is ``waiting_for`` when none is running.
 """
 
-import json
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from deltas_nets.captures.ids import id_in_json
-from deltas_nets.errors import UserError
-from deltas_nets.outputs.atomic_files import (
-    TEMPORARY,
-    cannot_write,
-    check_writable,
-    plain,
-    write_json,
-)
-from deltas_nets.outputs.beside import remove_beside
+from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.outputs.first_maps import FirstMaps
-from deltas_nets.outputs.journal import Journal, read_journals, remove_journals
-from deltas_nets.outputs.products import (
-    PRODUCTS,
-    FrameOutput,
-    OutputOptions,
-    products_of,
-    remarks_on,
-)
+from deltas_nets.outputs.journal import Journal, read_journals
+from deltas_nets.outputs.products import FrameOutput, OutputOptions, products_of, remarks_on
 from deltas_nets.outputs.shards import write_shard_summary
-from deltas_nets.outputs.summary import (
-    SHARD_SUMMARY,
-    SUMMARY,
-    WRITER,
-    difference,
-    read_summary,
-    shard_summary,
-)
+from deltas_nets.outputs.summary import SUMMARY, shard_summary
 
-__all__ = ["OutputFolder", "prepare_output"]
+__all__ = ["OutputFolder"]
 
 
 class OutputFolder:
-    """A folder being filled by one run; made by `prepare_output`."""
+    """A folder being filled by one run; made by `deltas_nets.outputs.prepare`."""
 
     def __init__(
         self,
@@ -139,137 +115,3 @@ class OutputFolder:
             self._journal.remove()
             for id, record in self._begun.items():
                 self._journal.add(id, record)
-
-
-def prepare_output(
-    out: str | Path,
-    *,
-    settings: Mapping[str, Any],
-    overwrite: bool = False,
-    forbidden: Path | None = None,
-    shard: tuple[int, int] = (1, 1),
-    frame_ids: Iterable[str] = (),
-    options: OutputOptions = OutputOptions(),  # noqa: B008
-    head: Mapping[str, Any] | None = None,
-) -> OutputFolder:
-    """Make or continue a folder for outputs, and write its summary with status ``running``.
-
-    Args:
-        out: the folder; its parents are made too.
-        settings: what the results depend on (weights, views, sizes ...; not the device or
-            the shard). A run continues another only where all of it is equal.
-        overwrite: start again: remove the frames that earlier runs were to write and what shows
-            them (`deltas_nets.outputs.beside`), and use a folder with other contents, in which only
-            files of the same names are replaced.
-        forbidden: the capture. Its own depth/ would be overwritten, so it is never an output.
-        shard: which of how many runs that fill the folder this is, from 1.
-        frame_ids: the frames of this run: what ``overwrite`` removes where others work too.
-        options: what all frames have in common.
-        head: goes to the summary beside the settings (versions, counts of lost frames).
-
-    Returns:
-        The folder; frames for which ``is_finished`` are to be kept.
-
-    Raises:
-        UserError: the folder cannot be written, holds something else, or was made with other
-            settings. Nothing in it has been changed then.
-    """
-    out, frame_ids = Path(out), list(frame_ids)
-    wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
-    if forbidden is not None and out.resolve() == forbidden.resolve():
-        what = "the output folder is the capture itself"
-        raise UserError(what, out, "name another folder with --out")
-    if any((out / name).is_dir() for name in ("color", "pose")):
-        # Its depth/ may be what a sensor measured: not even --overwrite is meant for that.
-        raise UserError("the output folder is a capture", out, "name another folder with --out")
-    check_writable(out)
-    # Listed before the summaries are read: what another shard has made by now has a summary.
-    found = sorted(os.listdir(out)) if out.exists() else []
-    others = [name for name in found if not TEMPORARY.match(name)]
-    summaries = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
-    earlier = [read for name in summaries if (read := read_summary(out / name)) is not None]
-    if not overwrite:
-        if others and not earlier:
-            what = f"the output folder holds something else ({', '.join(others[:3])})"
-            raise UserError(what, out, "name an empty folder, or add --overwrite")
-        if earlier and earlier[0]["settings"] != wanted:
-            what = f"an earlier run had other settings ({difference(earlier[0], wanted)})"
-            raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
-    own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
-    frames = {} if own is None else dict(own["frames"])
-    folder = OutputFolder(
-        out,
-        options=options,
-        head={
-            "writer": WRITER,
-            "status": "running",
-            **(head or {}),
-            "files": [product.name for product in products_of(options)],
-            "settings": wanted,
-            "anchors": list(map(id_in_json, frame_ids)),
-        },
-        frames={} if overwrite else frames,
-        shard=shard,
-    )
-    if not overwrite:
-        folder.recover(None if shard[1] == 1 else frame_ids)
-    try:
-        # Before the new summary: killed in between, the old one still says what made the rest.
-        out.mkdir(parents=True, exist_ok=True)
-        if overwrite:
-            old = {*frame_ids, *_not_planned(earlier, wanted, alone=shard[1] == 1)}
-            remove_beside(out, old, earlier[0]["settings"] if earlier else None)
-            _remove_frames(out, old)
-            if shard[1] == 1:
-                _remove_shard_summaries(out)
-                FirstMaps.remove_all(out)
-            folder.first.remove()
-        if shard[1] == 1:
-            _remove_temporary(out)
-        folder.write_summary("running")
-        if shard[1] == 1:
-            remove_journals(out)
-        for product in folder.products:
-            (out / product.name).mkdir(exist_ok=True)
-    except OSError as error:
-        raise cannot_write(Path(error.filename or out), error) from error
-    return folder
-
-
-def _not_planned(
-    earlier: Iterable[Mapping[str, Any]], wanted: Mapping[str, Any], *, alone: bool
-) -> set[str]:
-    """Frames that earlier runs were to write and no run of ours writes now.
-
-    Args:
-        earlier: summaries.
-        wanted: the settings of now, which name the frames of all shards.
-        alone: no other shard is at work.
-    """
-    planned = {str(id) for summary in earlier for id in summary.get("anchors", ())}
-    if alone:
-        return planned
-    # Others may have written theirs by now.
-    view_sets = wanted.get("view_sets")
-    return planned - {str(anchor) for anchor, _ in view_sets} if view_sets else set()
-
-
-def _remove_frames(out: Path, ids: Iterable[str]) -> None:
-    """Remove the outputs of these frames; other files of the folder are not ours."""
-    for id in ids:
-        for product in PRODUCTS:
-            product.file(out, id).unlink(missing_ok=True)
-
-
-def _remove_shard_summaries(out: Path) -> None:
-    for path in out.iterdir():
-        if SHARD_SUMMARY.fullmatch(path.name):
-            path.unlink()
-
-
-def _remove_temporary(out: Path) -> None:
-    """Remove what a killed run left half written; not beside other shards, which live."""
-    files = [*out.glob("*"), *(file for row in PRODUCTS for file in (out / row.name).rglob("*"))]
-    for path in files:
-        if TEMPORARY.match(path.name):
-            path.unlink(missing_ok=True)

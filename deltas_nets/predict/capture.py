@@ -70,7 +70,7 @@ def predict_capture(
         predictor: of a trained network.
         capture: the frames.
         view_sets: anchors and sources.
-        folder: from :func:`deltas_nets.outputs.folder.prepare_output`.
+        folder: from :func:`deltas_nets.outputs.prepare.prepare_output`.
         config: sizes, range, confidence.
         heard: view sets whose maps the others hear in later passes, and nobody sees.
         search: how depth is searched; in the config's range if not given.

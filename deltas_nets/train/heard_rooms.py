@@ -53,13 +53,20 @@ class HeardRooms(Dataset[int]):
         model: makes the maps; it is not changed.
         folder: of the files, 15 MB each for ten views of 288 x 384.
         num_sources: of each map.
+        seed: of which views these are.
     """
 
     def __init__(
-        self, rooms: RoomViews, model: Deltas, folder: Path, *, num_sources: int = 2
+        self,
+        rooms: RoomViews,
+        model: Deltas,
+        folder: Path,
+        *,
+        num_sources: int = 2,
+        seed: int = 0,
     ) -> None:
         self.rooms, self.model, self.folder = rooms, model, folder
-        self.num_sources = num_sources
+        self.num_sources, self.seed = num_sources, seed
 
     def __len__(self) -> int:
         return len(self.rooms)
@@ -69,7 +76,7 @@ class HeardRooms(Dataset[int]):
             self.view(index, 0)
         except (OSError, SafetensorError, KeyError, ValueError):  # not there, or damaged
             room = self.rooms[index]
-            content = save(self._heard(room, torch.Generator().manual_seed(index)))
+            content = save(self._heard(room, torch.Generator().manual_seed(self.seed + index)))
             self.folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self._file(index), lambda opened: opened.write(content))
         return index

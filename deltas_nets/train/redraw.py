@@ -44,8 +44,7 @@ from deltas_nets.weights_file import (
 
 __all__ = ["Lesson", "RedrawConfig", "learns", "lesson", "train_redraw", "with_redraw"]
 
-LOSS = LossConfig(spread=0)
-"""Of the map alone; the deviation stays that of the agreement."""
+LOSS = LossConfig()
 AVERAGE, WARMUP, CLIP = 0.98, 20, 1.0
 LOGGED = 20
 DIVERGED = 2.0
@@ -147,7 +146,13 @@ def heard_rooms(model: Deltas, config: RedrawConfig, folder: Path) -> HeardRooms
         close_ups=config.close_ups,
     )
     on_host = copy.deepcopy(model).cpu()  # its processes cannot share another device
-    return HeardRooms(DisturbedRooms(rooms), on_host, folder, num_sources=config.num_sources)
+    return HeardRooms(
+        DisturbedRooms(rooms),
+        on_host,
+        folder,
+        num_sources=config.num_sources,
+        seed=config.first_room,
+    )
 
 
 def with_redraw(model: Deltas, source: Path) -> Deltas:
@@ -208,6 +213,7 @@ def learns(model: Deltas, lesson: Lesson, optimizer: torch.optim.Optimizer) -> d
         "gradient": float(losses.terms["gradient"].detach()),
         "abs_rel_agreed": _abs_rel(agreed.depth, truth),
         "abs_rel_redrawn": _abs_rel(drawn.log_depth[0].detach().exp(), truth),
+        "spread": float(losses.terms["spread"].detach()),
     }
 
 

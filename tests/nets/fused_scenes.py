@@ -8,7 +8,7 @@ import torch
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.fuse import DepthView
-from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.outputs.products import FrameOutput
 
 K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], dtype=torch.float64)

@@ -7,7 +7,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
-from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.outputs.products import FrameOutput, OutputOptions
 from deltas_nets.page.scene import camera_of
 from deltas_nets.page.surfaces import Surface

@@ -13,7 +13,7 @@ from small_output import write_frame
 
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.outputs.beside import PAGE, PREVIEWS, SHEET, range_of_page
-from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.page.maps import open_maps
 from deltas_nets.page.write import write_page
 

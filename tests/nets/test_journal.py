@@ -11,7 +11,8 @@ import pytest
 import small_output
 from run_command import Run
 
-from deltas_nets.outputs.folder import OutputFolder, prepare_output
+from deltas_nets.outputs.folder import OutputFolder
+from deltas_nets.outputs.prepare import prepare_output
 
 SETTINGS: dict[str, Any] = {"views": 3}
 MakeCapture = Callable[..., Path]

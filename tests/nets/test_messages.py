@@ -17,7 +17,7 @@ from PIL import Image
 from small_capture import FAULTS, WRONG_VIEW_SETS, write_capture, write_view_sets
 
 from deltas_nets import cli
-from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.prepare import prepare_output
 
 GOLDEN = Path(__file__).with_name("messages.txt")
 

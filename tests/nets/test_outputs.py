@@ -16,10 +16,10 @@ from PIL import Image
 from small_output import output_of, summary_of, write_frame
 
 from deltas_nets.errors import UserError
-from deltas_nets.outputs import folder as output_folder
+from deltas_nets.outputs import prepare as output_prepare
 from deltas_nets.outputs import products
 from deltas_nets.outputs.atomic_files import write_json
-from deltas_nets.outputs.folder import prepare_output
+from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.outputs.products import (
     FrameOutput,
     OutputOptions,
@@ -111,7 +111,7 @@ def test_a_product_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         path.write_text(frame.anchor.id)
 
     rows = (*products.PRODUCTS, products.Product("names", ".txt", write))
-    for module in (products, output_folder):
+    for module in (products, output_prepare):
         monkeypatch.setattr(module, "PRODUCTS", rows)
     folder = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"])
     write_frame(folder, "1")

@@ -118,7 +118,7 @@ def test_without_the_stage_agreed_maps_stay(plain: Deltas) -> None:
     assert plain.redrawn(plain.encode(images[None]), agreed) is agreed
     drawn = with_redraw(plain, HERE).redrawn(plain.encode(images[None]), agreed)
     assert (drawn.depth != agreed.depth).any() and drawn.depth.isfinite().all()
-    torch.testing.assert_close(drawn.deviation, agreed.deviation, rtol=0, atol=0)
+    assert (drawn.deviation != agreed.deviation).all() and (drawn.deviation > 0).all()
 
 
 @torch.inference_mode()

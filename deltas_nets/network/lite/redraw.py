@@ -12,7 +12,7 @@ from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.known_depth import KnownDepth, as_points
 from deltas_nets.network.lite.densifier import DenseDepth, Densifier
 
-WINDOW = 15
+WINDOW = 41
 """Pixels: over squares so wide the map keeps the depth, in the mean of its log, that was agreed on.
 What is drawn anew is what differs within them."""
 
