@@ -19,8 +19,9 @@ class Recipe(Command):
 
     night is for two CPU cores: small rooms, then large ones. hour is for a GPU and a dozen cores.
     Each part gets a folder in --out with its config, log, checkpoint and weights; at the end
-    weights.safetensors has calibrated standard deviations. The same command goes on with a run
-    that was stopped, though a calibration starts again; --init with weights of an earlier one.
+    weights.safetensors has calibrated standard deviations, and a stage that redraws maps on which
+    frames agreed. The same command goes on with a run that was stopped, though the calibration and
+    the steps of that stage start again; --init with weights of an earlier one.
 
     Example: deltas recipe night --out runs/night --teacher-weights aliked-n16.pth
     """
@@ -52,7 +53,8 @@ class Recipe(Command):
         from deltas_nets.commands.train import encoder_file
         from deltas_nets.distill.teachers import load_teacher
         from deltas_nets.outputs.atomic_files import check_writable
-        from deltas_nets.train.recipe import Beginning, begin, run_parts, sign
+        from deltas_nets.terminal import progress
+        from deltas_nets.train.recipe import Beginning, add_redraw, begin, run_parts, sign
         from deltas_nets.weights_file import load_model, weights_file
 
         if int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -91,13 +93,20 @@ class Recipe(Command):
             teacher=self.teacher_weights,
         )
         print(f"calibration on {recipe.calibration_rooms} rooms for each number of views")
+        calibrated = self.out / "calibrated.safetensors"
         Calibrate(
-            out=finished,
+            out=calibrated,
             weights=str(weights),
             rooms=recipe.calibration_rooms,
             size=recipe.calibration_size,
+            overwrite=True,
         ).run()
-        sign(finished, recipe, beginning)
+        steps, rooms = recipe.redraw_steps, recipe.redraw_rooms
+        print(f"the stage that redraws: {rooms} rooms, {steps} steps")
+        with progress("redraw", rooms + steps) as report:
+            redrawn = add_redraw(recipe, calibrated, self.out, workers=workers, report=report)
+        sign(redrawn, recipe, beginning)
+        redrawn.replace(finished)
 
     def _workers(self) -> int:
         if self.workers is None:

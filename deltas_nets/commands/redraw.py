@@ -12,9 +12,8 @@ class Redraw(RedrawConfig, Command):
     """Train the stage that draws a map anew after several frames agreed on it.
 
     Nothing else of the network changes, nor do maps of one pass. It learns from procedural rooms:
-    from the network's own maps of them, with errors as they are left where neighbours agree.
-    --init goes on from weights that have the stage; a network that learns on (`deltas train
-    --init`) loses it.
+    from the network's own maps of them, after these have heard each other. --init goes on from
+    weights that have the stage; a network that learns on (`deltas train --init`) loses it.
 
     Example: deltas redraw --out mine.safetensors --log mine.jsonl
     """
@@ -33,6 +32,6 @@ class Redraw(RedrawConfig, Command):
         from deltas_nets.train.redraw import train_redraw
 
         device = usable_device(self.device)
-        with progress("redraw", self.steps) as report:
+        with progress("redraw", self.num_rooms + self.steps) as report:
             train_redraw(self, device=device, overwrite=self.overwrite, report=report)
         print(f"weights in {self.out}")

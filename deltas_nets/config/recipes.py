@@ -8,7 +8,7 @@ from deltas_nets.config.training import DataConfig, TrainConfig
 
 RecipeName = Literal["night", "hour"]
 FEWEST_ROOMS = 2
-"""To calibrate on."""
+"""To calibrate on, and to learn to redraw from."""
 
 
 class Part(NamedTuple):
@@ -30,17 +30,27 @@ class Recipe(NamedTuple):
         parts: trainings.
         calibration_rooms: for each curve of the spread, which is fitted last.
         calibration_size: height and width of their images: where the weights will work.
+        redraw_steps: of the stage that redraws (`deltas redraw`), the last thing that is trained.
+        redraw_rooms: for it.
+        redraw_sizes: height and width of their images.
     """
 
     parts: tuple[Part, ...]
     calibration_rooms: int = 200
     calibration_size: tuple[int, int] = (288, 384)
+    redraw_steps: int = 1000
+    redraw_rooms: int = 300
+    redraw_sizes: tuple[tuple[int, int], ...] = ((288, 384), (240, 320))
 
     def scaled(self, effort: float) -> "Recipe":
         """Take a share of the steps and of the rooms to calibrate on, a few at least."""
         scaled = self._each(lambda c: replace(c, steps=max(1, round(effort * c.steps))))
         rooms = min(500, round(effort * self.calibration_rooms))
-        return scaled._replace(calibration_rooms=max(FEWEST_ROOMS, rooms))
+        return scaled._replace(
+            calibration_rooms=max(FEWEST_ROOMS, rooms),
+            redraw_steps=max(1, round(effort * self.redraw_steps)),
+            redraw_rooms=max(FEWEST_ROOMS, round(effort * self.redraw_rooms)),
+        )
 
     def taught_by(
         self, teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"]

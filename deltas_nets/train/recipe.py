@@ -10,6 +10,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.train.checkpoint import CHECKPOINT
 from deltas_nets.train.fit import fit
+from deltas_nets.train.redraw import RedrawConfig, train_redraw
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.start import Start
 from deltas_nets.weights_file import load_model, read_metadata, save_weights, sha256_of
@@ -116,6 +117,41 @@ def run_parts(
         weights = fit(part.config, folder / part.name, start, report=report)
     assert weights is not None, "a recipe has parts"
     return weights
+
+
+def add_redraw(
+    recipe: Recipe,
+    weights: Path,
+    folder: Path,
+    *,
+    workers: int,
+    report: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Train the stage that redraws, the last of a recipe; its rooms are kept in the folder.
+
+    Args:
+        recipe: its numbers of steps and rooms.
+        weights: calibrated.
+        folder: gets the rooms, a log and the weights.
+        workers: processes that make rooms.
+        report: called after every room and every step.
+
+    Returns:
+        The weights with the stage.
+    """
+    log = folder / "redraw.jsonl"
+    log.unlink(missing_ok=True)
+    config = RedrawConfig(
+        folder / "redrawn.safetensors",
+        init=str(weights),
+        steps=recipe.redraw_steps,
+        num_rooms=recipe.redraw_rooms,
+        sizes=recipe.redraw_sizes,
+        workers=workers,
+        cache=folder / "heard-rooms",
+        log=log,
+    )
+    return train_redraw(config, overwrite=True, report=report)
 
 
 def sign(weights: Path, recipe: Recipe, beginning: Beginning) -> None:

@@ -5,6 +5,7 @@ to draw them as the rooms are. The command is `deltas redraw`.
 """
 
 import copy
+import hashlib
 import json
 import tempfile
 from collections.abc import Callable
@@ -31,6 +32,7 @@ from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.lite.redraw import Redraw
 from deltas_nets.outputs.atomic_files import check_writable
 from deltas_nets.rooms import Rooms
+from deltas_nets.rooms.rooms import VERSION
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.heard_rooms import HeardRooms
 from deltas_nets.train.step import DEPTH_RANGE
@@ -39,6 +41,7 @@ from deltas_nets.weights_file import (
     load_model,
     read_metadata,
     save_weights,
+    sha256_of,
     weights_file,
 )
 
@@ -136,8 +139,17 @@ def _learn(
 
 
 def heard_rooms(model: Deltas, config: RedrawConfig, folder: Path) -> HeardRooms:
-    """The rooms that a training learns from, whose files are in a folder; made on the host."""
+    """The rooms that a training learns from; made on the host.
+
+    Args:
+        model: the network, from ``config.init``.
+        config: what rooms, and how they are seen.
+        folder: gets a folder of files for what both decide, so that no others are ever read.
+    """
     height, width = (max(side) for side in zip(*config.sizes, strict=True))
+    seen = (config.num_views, config.num_sources, height, width, config.close_ups)
+    decides = (sha256_of(weights_file(config.init)), VERSION, config.first_room, *seen)
+    name = hashlib.sha256(repr(decides).encode()).hexdigest()[:12]
     rooms = Rooms(
         config.num_rooms,
         seed=config.first_room,
@@ -149,7 +161,7 @@ def heard_rooms(model: Deltas, config: RedrawConfig, folder: Path) -> HeardRooms
     return HeardRooms(
         DisturbedRooms(rooms),
         on_host,
-        folder,
+        folder / name,
         num_sources=config.num_sources,
         seed=config.first_room,
     )

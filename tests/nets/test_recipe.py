@@ -32,6 +32,9 @@ SMALL = Recipe(
     ),
     calibration_rooms=FEWEST_ROOMS,
     calibration_size=(48, 64),
+    redraw_steps=1,
+    redraw_rooms=1,
+    redraw_sizes=((48, 64),),
 )
 FIRST, SECOND = (part.name for part in SMALL.parts)
 
@@ -121,8 +124,10 @@ def test_the_command_trains_and_calibrates(tmp_path: Path, run: Run) -> None:
     made = json.loads(record["recipe"])
     assert [part["steps"] for part in made["parts"]] == [1, 2]
     assert (made["recipe"], made["effort"], made["init"]) == ("night", 1.0, None)
-    said = torch.tensor([-3.0])
-    assert not torch.equal(load_model(out / "weights.safetensors").calibration(said, 3), said)
+    said, model = torch.tensor([-3.0]), load_model(out / "weights.safetensors")
+    assert not torch.equal(model.calibration(said, 3), said)
+    assert model.redraw is not None and record["redraw_step"] == "1"
+    assert not (out / "redrawn.safetensors").exists()
     assert_one_line(run("recipe", "night", "--out", out, "--workers", 0), "finished", "weights")
 
 
