@@ -218,6 +218,9 @@ class Deltas(nn.Module):
     def redrawn(self, encoded: Encoded, agreed: KnownDepth) -> KnownDepth:
         """A map that several frames agreed on, with the edges that the image shows.
 
+        Its deviation is the geometric mean of what the frames state, which tells better where a map
+        is sure, and of what the stage has learned, which tells better how sure.
+
         Without a stage that redraws, as in networks of which `deltas redraw` trained none, it stays
         as it is.
 
@@ -228,7 +231,9 @@ class Deltas(nn.Module):
         if self.redraw is None:
             return agreed
         drawn = self.redraw(encoded.features, agreed)
-        return KnownDepth(drawn.log_depth[0].exp(), _log_deviation(drawn).exp())
+        learned = _log_deviation(drawn).exp()
+        both = torch.where(agreed.depth > 0, (agreed.deviation * learned).sqrt(), learned)
+        return KnownDepth(drawn.log_depth[0].exp(), both)
 
     def complete(self, encoded: Encoded, known: KnownDepth) -> Densified:
         """A map of one image and depth that is known of it; no other view is looked at.

@@ -122,6 +122,27 @@ def test_without_the_stage_agreed_maps_stay(plain: Deltas) -> None:
 
 
 @torch.inference_mode()
+def test_the_deviation_is_between_what_frames_state_and_what_the_stage_learned(
+    plain: Deltas,
+) -> None:
+    model = with_redraw(plain, HERE)
+    encoded = model.encode(views_of(1)[0][None])
+    depth = maps(0, (64, 96))
+    depth[..., :20] = 0
+
+    def stated(deviation: float) -> torch.Tensor:
+        return model.redrawn(
+            encoded, KnownDepth(depth, torch.full_like(depth, deviation))
+        ).deviation
+
+    known = depth > 0
+    # A deviation near 0 leaves the weights of the points, and so what is drawn, as they are.
+    ratio = stated(1e-6) / stated(4e-6)
+    torch.testing.assert_close(ratio[known], torch.full_like(ratio[known], 0.5))
+    torch.testing.assert_close(ratio[~known], torch.ones_like(ratio[~known]))
+
+
+@torch.inference_mode()
 def test_the_stage_is_a_densifier_of_the_map_that_keeps_it_at_large(plain: Deltas) -> None:
     stage = with_redraw(plain, HERE).redraw
     assert isinstance(stage, Redraw)
