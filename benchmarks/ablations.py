@@ -1,6 +1,7 @@
 """What each part of deltas-small is worth: the same short training with one thing changed.
 
 python benchmarks/ablations.py --cache DIR [--only NAME ...] [--steps 300] [--results FILE]
+                               [--figure FILE]
 
 All variants see the same rooms in the same order from the same seed, and are scored on rooms that
 no training uses, three views each, with the usual blur, noise and pose errors. The one with
@@ -176,6 +177,25 @@ def table(records: dict[str, dict[str, Any]]) -> str:
     return "\n".join(f"| {row} |" for row in rows)
 
 
+def draw(records: dict[str, dict[str, Any]], file: Path) -> None:
+    """The share of the maps within 25 %, by variant; between the lines is what a seed may do."""
+    from matplotlib.figure import Figure
+
+    names = [name for name in VARIANTS if name in records]
+    shares = [records[name]["dense_delta1"] for name in names]
+    figure = Figure(figsize=(8, 0.35 * len(names) + 1), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(shares, range(len(names)), "o")
+    for name, share in zip(names, shares, strict=True):
+        if name.startswith("default"):
+            axes.axvline(share, color="grey", linewidth=0.8)
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlabel("delta < 1.25 of maps of rooms that no training uses")
+    axes.grid(axis="y", alpha=0.3)
+    figure.savefig(file, dpi=120)
+
+
 def main() -> None:
     """Train what is not yet in the results, and print the table."""
     parser = argparse.ArgumentParser()
@@ -185,6 +205,7 @@ def main() -> None:
     parser.add_argument("--held-out", type=int, default=100, help="rooms to score on")
     parser.add_argument("--cache", required=True, help="folder that keeps rendered rooms")
     parser.add_argument("--results", type=Path, default=Path("runs/ablations/results.jsonl"))
+    parser.add_argument("--figure", type=Path, help="image file to draw the table to")
     arguments = parser.parse_args()
     settings = {name: vars(arguments)[name] for name in ("steps", "rooms", "held_out")}
     shared, file = budget(arguments), arguments.results
@@ -197,6 +218,8 @@ def main() -> None:
         with file.open("a", encoding="utf-8") as opened:
             print(json.dumps(record | WHERE), file=opened)
     print(table(finished(file, settings)))
+    if arguments.figure is not None:
+        draw(finished(file, settings), arguments.figure)
 
 
 if __name__ == "__main__":

@@ -95,6 +95,8 @@ def train_redraw(
     check_new_weights(config.out, overwrite=overwrite)
     if config.log is not None:
         check_writable(config.log.parent)
+    if config.cache is not None:
+        check_writable(config.cache)
     model = with_redraw(load_model(config.init).to(device), weights_file(config.init))
     assert model.redraw is not None
     before = read_metadata(weights_file(config.init))

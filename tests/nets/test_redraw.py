@@ -298,6 +298,7 @@ def test_trained_stages_go_on(plain: Deltas, tmp_path: Path) -> None:
         (("--out", "w.safetensors", "--sizes", 10, 10), ("32 or more",)),
         (("--out", "w.safetensors", "--first-room", 5), ("1000 or more",)),
         (("--out", "w.safetensors", "--log", "/dev/null/x.jsonl"), ("/dev/null",)),
+        (("--out", "w.safetensors", "--cache", "/dev/null/rooms"), ("/dev/null",)),
         (("--out", "w.safetensors", "--init", "no-points"), ("no such weights",)),
     ],
 )
