@@ -325,3 +325,14 @@ def test_a_capture_in_another_unit_is_drawn_alike(
         found.append(passes.drawn(id, map).depth / scale)
     torch.testing.assert_close(found[1], found[0], rtol=1e-4, atol=0)
     assert not found[0].equal(maps(3, (64, 96))[0])
+
+
+@given(SEEDS)
+def test_around_a_pixel_is_a_square_less_what_is_outside(seed: int) -> None:
+    image = maps(seed, (30, 50))
+    inside = torch.nn.functional.avg_pool2d(
+        image, WINDOW, stride=1, padding=WINDOW // 2, count_include_pad=False
+    )
+    # Of a map of zeros that was agreed on everywhere, what is kept is less its mean around.
+    kept = kept_at_large(image, torch.ones_like(image))
+    torch.testing.assert_close(image - kept, inside, rtol=1e-4, atol=1e-5)
