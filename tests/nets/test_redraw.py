@@ -199,7 +199,8 @@ def test_maps_that_hear_each_other_in_memory_do_as_those_of_a_capture(
     ids = list(capture.frames)[:4]
     size, first = (64, 96), FirstMaps(tmp_path / "first")
     alone = KnownDepth(
-        torch.cat([maps(seed, size) for seed in range(4)]), torch.full((4, 1, *size), 0.05)
+        torch.stack([torch.full((1, *size), 2 + 0.04 * n) for n in range(4)]),
+        torch.full((4, 1, *size), 0.05),
     )
     for n, id in enumerate(ids):
         first.write(id, KnownDepth(*(part[n] for part in alone)), {})
@@ -212,7 +213,10 @@ def test_maps_that_hear_each_other_in_memory_do_as_those_of_a_capture(
         found = hear_each_other(alone, views, passes=passed)
         for n, id in enumerate(ids):
             expected = passes.hear(id, told)
-            torch.testing.assert_close(found.depth[n], expected.depth, rtol=1e-3, atol=1e-3)
+            torch.testing.assert_close(found.depth[n], expected.depth, rtol=1e-4, atol=1e-4)
+    once = hear_each_other(alone, views, passes=2)
+    assert (once.depth - alone.depth).abs().max() > 0.01, "they agree"
+    assert (found.depth - once.depth).abs().max() > 1e-3, "and hear what has heard"
 
 
 def passes_views(capture: Capture, ids: list[str], size: tuple[int, int]) -> PosedViews:
