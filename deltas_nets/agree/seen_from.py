@@ -54,13 +54,12 @@ def _nearest(
         image_size: of the result.
     """
     count, size = len(z), image_size[0] * image_size[1]
-    first = torch.arange(count, device=z.device)[:, None] * size
-    place = (place + first)[inside]
-    z, deviation = z[inside], maps.deviation.reshape(count, -1)[inside]
-    depth = z.new_full((count * size,), torch.inf).scatter_reduce_(0, place, z, "amin")
-    wins = z == depth[place]
-    drawn = torch.zeros_like(depth)
-    drawn[place[wins]] = deviation[wins]
-    depth[depth == torch.inf] = 0.0
+    nowhere = z.new_full((count, size + 1), torch.inf)  # what falls on no pixel goes to the last
+    place = torch.where(inside, place, size)
+    depth = nowhere.scatter_reduce(1, place, z, "amin")
+    place = torch.where(z == depth.gather(1, place), place, size)
+    # Of points of one depth the surest: which is drawn last is left open on a GPU.
+    deviation = nowhere.scatter_reduce_(1, place, maps.deviation.reshape(count, -1), "amin")
     shape = (count, 1, *image_size)
-    return KnownDepth(depth.view(shape), drawn.view(shape))
+    found = (part[:, :size].reshape(shape) for part in (depth, deviation))
+    return KnownDepth(*(torch.where(part == torch.inf, 0.0, part) for part in found))
