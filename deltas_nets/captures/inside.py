@@ -1,4 +1,4 @@
-"""A folder of captures, of which one has to be named."""
+"""A folder of captures: the only one is meant, of several one has to be named."""
 
 from collections.abc import Collection, Sequence
 from itertools import islice
@@ -8,7 +8,7 @@ from typing import Protocol
 from deltas_nets.captures.ids import ids_in_words, natural_key
 from deltas_nets.errors import UserError
 
-__all__ = ["several_captures"]
+__all__ = ["captures_inside", "several_captures"]
 
 MOST = 200
 """Folders that are looked into."""
@@ -21,10 +21,10 @@ class Recogniser(Protocol):
         """Whether a folder looks like its format."""
 
 
-def several_captures(
+def captures_inside(
     path: Path, readers: Collection[Recogniser], reader: Recogniser | None
-) -> UserError | None:
-    """Why a folder is refused that is no capture itself, but whose folders are.
+) -> Sequence[Path]:
+    """The captures in a folder that is none itself; none where it is one.
 
     Args:
         path: a folder.
@@ -33,16 +33,17 @@ def several_captures(
     """
     found = [folder for folder in _folders(path) if any(one.recognises(folder) for one in readers)]
     if reader is None:
-        others = found
-    else:
-        # Parts of one capture are all of one format: models, reconstructions.
-        others = [folder for folder in found if not reader.recognises(folder)]
-    if not others or (reader is not None and len(found) < 2):
-        return None
-    names = ids_in_words(folder.name for folder in found)
-    many = "a capture" if len(found) == 1 else f"{len(found)} captures"
-    what = f"the folder holds {many} ({names}) and is none itself"
-    return UserError(what, path, f"name one of them, as {found[0]}")
+        return found
+    # Parts of one capture are all of one format: models, reconstructions.
+    others = any(not reader.recognises(folder) for folder in found)
+    return found if others and len(found) > 1 else []
+
+
+def several_captures(path: Path, inside: Sequence[Path]) -> UserError:
+    """Why a folder of captures is refused."""
+    names = ids_in_words(folder.name for folder in inside)
+    what = f"the folder holds {len(inside)} captures ({names}) and is none itself"
+    return UserError(what, path, f"name one of them, as {inside[0]}")
 
 
 def _folders(path: Path) -> Sequence[Path]:

@@ -13,7 +13,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.images import image_size_of
-from deltas_nets.captures.inside import several_captures
+from deltas_nets.captures.inside import captures_inside, several_captures
 from deltas_nets.captures.readers import (
     arkitscenes,
     colmap,
@@ -27,6 +27,7 @@ from deltas_nets.captures.readers import (
     polycam,
     record3d,
     robustmvd,
+    scanner_app,
     scannet,
     sens,
     sevenscenes,
@@ -76,6 +77,7 @@ READERS: tuple[Reader, ...] = (
     tum,
     record3d,
     polycam,
+    scanner_app,
     sevenscenes,
     robustmvd,
     opensfm,
@@ -121,9 +123,11 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
     try:
         reader = next((reader for reader in READERS if reader.recognises(path)), None)
         if path.is_dir() and (reader is None or _found_inside(reader, path)):
-            several = several_captures(path, READERS, reader)
-            if several is not None:
-                raise several
+            inside = captures_inside(path, READERS, reader)
+            if len(inside) > 1:
+                raise several_captures(path, inside)
+            if inside:  # as archives unpack: a folder in a folder of the same name
+                return open_capture(inside[0], intrinsics=intrinsics)
         if reader is None:
             what = "there is no capture in the folder" if path.is_dir() else "this is no capture"
             raise _part_of(path) or refusal(path) or UserError(what, path, _LAYOUTS)

@@ -1,4 +1,4 @@
-"""A folder that holds captures and is none itself is refused, and they are named."""
+"""A folder that is none itself: the only capture in it is opened, of several all are named."""
 
 from pathlib import Path
 
@@ -20,7 +20,6 @@ def _with(folder: Path, **kinds: str) -> None:
 @pytest.mark.parametrize(
     "kinds",
     [
-        {"a": "own"},
         {"a": "own", "b": "transforms"},
         {"a": "own", "b": "colmap"},
         {"a": "own", "b": "scannet", "c": "colmap-bin"},
@@ -40,3 +39,12 @@ def test_a_capture_may_hold_others(tmp_path: Path) -> None:
     _with(tmp_path, whole="colmap")
     _with(tmp_path / "whole", nerf="transforms", mine="own")
     assert open_capture(tmp_path / "whole").layout == "COLMAP text"
+
+
+@pytest.mark.parametrize("to", ["own", "transforms", "colmap", "scannet"])
+def test_the_only_capture_of_a_folder_is_opened(tmp_path: Path, to: str) -> None:
+    _with(tmp_path / "download", scan=to)
+    (tmp_path / "download" / "readme.txt").write_text("thanks")
+    (tmp_path / "download" / "previews").mkdir()
+    outer, inner = (open_capture(tmp_path / "download" / part) for part in ("", "scan"))
+    assert outer.layout == inner.layout and list(outer.frames) == list(inner.frames)

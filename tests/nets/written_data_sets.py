@@ -1,5 +1,6 @@
-"""The scene of `written_captures` in the layouts of data sets: ARKitScenes and LLFF."""
+"""The scene of `written_captures` as ARKitScenes, LLFF and 3D Scanner App have it."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from written_captures import (
     CX,
     CY,
     NUM,
+    OPENGL,
     F,
     Scene,
     Writer,
@@ -54,4 +56,29 @@ def llff(folder: Path, scene: Scene) -> Written:
     return Written(folder, [f"IMG {i}" for i in range(NUM)], K=middle, metric=False, doubts=1)
 
 
-DATA_SETS: dict[str, Writer] = {"ARKitScenes": arkitscenes, "LLFF": llff}
+def scanner_app(folder: Path, scene: Scene) -> Written:
+    """A scan as it is shared: more poses than photos, depth with what is known of it beside."""
+    for i, pose in enumerate(scene.world_from_cam @ OPENGL):
+        camera = {
+            "cameraPoseARFrame": pose.ravel().tolist(),
+            "intrinsics": [F, 0, CX + 0.5, 0, F, CY + 0.5, 0, 0, 1],
+            "projectionMatrix": [1.0] * 16,
+            "frame_index": 5 * i,
+            "time": 100 + i / 12,
+            "motionQuality": 0.9,
+        }
+        write_image(folder / f"frame_{5 * i:05d}.jpg", scene.images[i])
+        write_steps(folder / f"depth_{5 * i:05d}.png", scene.depths[i])
+        write_image(folder / f"conf_{5 * i:05d}.png", np.full((24, 32), 2, np.uint8))
+        for number in (5 * i, 5 * i + 1):
+            (folder / f"frame_{number:05d}.json").write_text(json.dumps(camera))
+    write_image(folder / "thumb_00000.jpg", scene.images[0])
+    (folder / "info.json").write_text(json.dumps({"title": "Scan"}))
+    return Written(folder, [f"frame_{5 * i:05d}" for i in range(NUM)], None, True)
+
+
+DATA_SETS: dict[str, Writer] = {
+    "ARKitScenes": arkitscenes,
+    "LLFF": llff,
+    "3D Scanner App": scanner_app,
+}

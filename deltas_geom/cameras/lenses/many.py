@@ -26,7 +26,7 @@ from deltas_geom.cameras.lenses.tables import Table, table_of
 Array = NDArray[Any]
 MANY = 32768
 """Pixels from which on a table is worth being made."""
-_CHUNK = 16384
+_CHUNK = 24576
 _SAMPLED = 512  # pixels, for how far the table goes
 _TOLERANCE = 1e-13
 _Rays = tuple[Tensor, Tensor]

@@ -27,7 +27,7 @@ from deltas_geom.numerics.vectors import as_one
 
 _LARGEST = 1e30  # of a coefficient, or a pixel in focal lengths
 _FAR = 1e60  # of a coordinate
-_CACHED = 16384
+_CACHED = 24576
 """Items at a time, so that what lies between stays in the cache and no threads start."""
 _Both = tuple[Tensor, Tensor]
 

@@ -32,8 +32,9 @@ from deltas_nets.errors import UserError
 
 __all__ = ["capture_of_model", "read", "recognises"]
 
-IMAGE_FOLDERS = ("images", "input")
-"""Where programs that use COLMAP look for images: beside the model, or a folder or two above."""
+IMAGE_FOLDERS = ("images", "input", "resized_images")
+"""Where programs that use COLMAP look for images: beside the model, or a folder or two above.
+ScanNet++ has the last, and images without distortion of the same names in another."""
 LARGEST_SIZE = 2**20
 """Pixels of a side."""
 

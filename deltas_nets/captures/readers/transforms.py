@@ -113,13 +113,19 @@ def _files(path: Path) -> list[Path]:
     return [whole] if whole.is_file() else [part for part in parts if part.is_file()]
 
 
+def _image_folders(folder: Path) -> list[Path]:
+    """Besides the folder itself; ScanNet++ has the file beside the images, in a folder so called."""
+    of_scannetpp = [folder.parent / "resized_images"] if folder.name == "nerfstudio" else []
+    return [folder / "images", *of_scannetpp]
+
+
 def _entries(file: Path, folder: Path) -> list[_Entry]:
     root = Fields(
         read_json(file, name="transforms", remedy=REMEDY), file, where="it", remedy=REMEDY
     )
     if not root.items("frames"):
         raise root.error("has no frames")
-    finder = FileFinder(folder, [folder / "images"])
+    finder = FileFinder(folder, _image_folders(folder))
     entries = []
     for index, values in enumerate(root.items("frames")):
         frame = Fields(values, file, where=f"frame {index}", remedy=REMEDY)
