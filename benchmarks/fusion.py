@@ -225,7 +225,7 @@ class Truth(NamedTuple):
 
 
 def score_maps(path: Path, depths: Path) -> None:
-    """Accuracy, completeness and F-score of meshes and clouds, fused in four ways."""
+    """Accuracy, completeness and F-score of meshes and clouds, fused in several ways."""
     capture = open_capture(path).remembering()
     predicted = depth_source(capture, depths)
     sensor = Sensed(capture)
@@ -237,7 +237,7 @@ def score_maps(path: Path, depths: Path) -> None:
     truth = Truth(true_views, points, cKDTree(points))
     print(f"{path.name}, {len(predicted.ids)} maps; m, m, shares; at 5 cm")
     print("  confidence consistency sigma    accuracy completeness precision recall F-score >10 cm")
-    ways = [(0.0, 0), (0.3, 0), (0.3, 1), (0.5, 2), (0.6, 3), (0.7, 3)]
+    ways = [(0.0, 0), (0.4, 0), (0.4, 1), (0.5, 2), (0.6, 3), (0.7, 3)]
     for (least, agree), weighed in itertools.product(ways, (False, True)):
         source = depth_source(capture, depths, min_confidence=least)
         views = views_of(source, FuseConfig(neighbours=8 if agree else 0, least=max(agree, 1)))

@@ -52,7 +52,7 @@ class Fuse(Command):
     voxel: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
     """Side of a voxel in the capture's unit; from the deviation of the maps if not given."""
     min_confidence: Annotated[float | None, tyro.conf.arg(metavar="P")] = None
-    """Leave out pixels of less confidence, 0 to 1; 0.3 if not given."""
+    """Leave out pixels of less confidence, 0 to 1; 0.4 if not given."""
     consistency: Flag = True
     """Do not compare maps with each other: all depth counts."""
     neighbours: int = 8

@@ -24,7 +24,7 @@ from deltas_nets.outputs.their_capture import made_of
 
 __all__ = ["DepthSource", "Predicted", "Sensed", "depth_source"]
 
-LEAST_CONFIDENCE = 0.3
+LEAST_CONFIDENCE = 0.4
 """Of pixels that are used, if nothing else is said."""
 MOST_PREDICTED = 160_000
 """Pixels of a predicted map that are used, about as many as the network saw."""

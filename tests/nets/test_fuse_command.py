@@ -203,7 +203,7 @@ def test_what_is_left_out_is_told(maps: tuple[Path, Path], tmp_path: Path, run: 
     steps[36:] = 1000
     Image.fromarray(steps).save(file)
     result = run("fuse", *maps, "--out", tmp_path / "out", "--voxel", 0.05)
-    assert "50% is less sure than --min-confidence 0.3, " in result.out
+    assert "50% is less sure than --min-confidence 0.4, " in result.out
     left_out = json.loads((tmp_path / "out" / FUSE_SUMMARY).read_text())["left_out"]
     assert left_out["doubtful"] == 0.5 and 0.0625 <= left_out["unconfirmed"] < 0.1
 

@@ -114,7 +114,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _image_folders(folder: Path) -> list[Path]:
-    """Besides the folder itself; ScanNet++ has the file beside the images, in a folder so called."""
+    """Besides the folder itself; ScanNet++ has the file in a folder beside the images."""
     of_scannetpp = [folder.parent / "resized_images"] if folder.name == "nerfstudio" else []
     return [folder / "images", *of_scannetpp]
 
