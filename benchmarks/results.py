@@ -12,7 +12,7 @@ again from there.
 `measure` runs two parts at a time, each on one core, says how long the rest takes, and writes the
 page. Stopped, it goes on where it was. Parts are measured again where their commands, what is given
 or the code of the packages changed since; --only NAME ... looks at these parts alone, and --list
-says what would be done. What the commands print is in captures/logs.
+makes the links and says what would be done. What the commands print is in captures/logs.
 """
 
 import argparse
@@ -79,7 +79,9 @@ def main() -> None:
     parser.add_argument("--pairs", type=Path, help="folder with pairs_with_gt.txt and images")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="these parts alone")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--list", action="store_true", help="say what would be done")
+    parser.add_argument(
+        "--list", action="store_true", help="make the links and say what would be done"
+    )
     arguments = parser.parse_args()
     if arguments.what == "measure":
         given = {name: getattr(arguments, name) for name in ("walk", "scenes7", "weights", "pairs")}
@@ -105,6 +107,10 @@ def link(given: dict[str, Path]) -> None:
 
 def measure(only: Sequence[str] | None, jobs: int, *, only_say: bool) -> None:
     """Run what was not measured as it would be now."""
+    known_names = [part.name for part in parts()]
+    unknown = set(only or ()) - set(known_names)
+    if unknown:
+        sys.exit(f"no part is called {', '.join(sorted(unknown))}: {', '.join(known_names)}")
     chosen = [part for part in parts() if only is None or part.name in only]
     known, code = State(), fingerprint_of_code()
     keys = {part.name: key_of(part, code) for part in chosen}

@@ -5,7 +5,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from results_paper import GMACS, TABLE_1, TABLE_2, TABLE_3, TABLE_4
-from results_parts import CAPTURES, CURVES, HEARD, LENGTHS, RESULTS, ROOMS, SAME, depth_file, parts
+from results_parts import (
+    CAPTURES,
+    CURVES,
+    HEARD,
+    LENGTHS,
+    PAIRS,
+    RESULTS,
+    ROOMS,
+    SAME,
+    depth_file,
+    parts,
+)
 
 from deltas_nets.ablations.paper import PAPER, SPARSE_RATIO, PaperRow
 from deltas_nets.ablations.report import ON_SCANNET
@@ -66,7 +77,8 @@ def taken() -> Iterator[str]:
         minutes = sum(float(row["seconds"] or 0) for row in record.rows) / 60
         yield ""
         where = f"{record.machine['processor']}, {record.machine['cores']} cores"
-        yield f"Its {len(record.rows)} parts took {minutes:.0f} min in all, two at once ({where})."
+        count = len(record.rows)
+        yield f"Its {count} parts took {minutes:.0f} min if added up; two run at once ({where})."
 
 
 def detectors() -> Iterator[str]:
@@ -108,8 +120,9 @@ def three_frames() -> Iterator[str]:
     yield ""
     yield "Maps that hear each other: `deltas depth captures/walk --view-sets view_sets.json"
     yield "--views 3 --format npz --no-page --out captures/maps/walk-3`, then `deltas evaluate"
-    yield "captures/walk --predictions captures/maps/walk-3`. Rooms lie in ScanNet's layout and"
-    yield "are scored by the paper's protocol with frames 1 apart (command: table 3)."
+    yield "captures/walk --predictions captures/maps/walk-3`. Plane sweep: the command above with"
+    yield "`--weights plane-sweep`. Rooms lie in ScanNet's layout and are scored by the paper's"
+    yield "protocol with frames 1 apart (command: table 3)."
 
 
 def lengths() -> Iterator[str]:
@@ -132,7 +145,7 @@ def pairs() -> Iterator[str]:
     """Table 4."""
     yield from head("Table 4: pairs as DPSNet prepared them", found("depth/pairs"))
     rows = [(f"{name} (paper, Sun3D)", *figures(values)) for name, values in TABLE_4.items()]
-    rows += depth_row("deltas-small (procedural rooms)", "pairs", DEPTH)
+    rows += depth_row(f"deltas-small ({PAIRS} procedural rooms)", "pairs", DEPTH)
     yield from table(["", *DEPTH.values()], rows)
 
 

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -36,7 +37,6 @@ from deltas_nets.captures.readers import (
     tum,
 )
 from deltas_nets.captures.readers.colmap_folder import PLACES
-from deltas_nets.captures.readers.names import IMAGE_SUFFIXES
 from deltas_nets.captures.readers.refused import refusal
 from deltas_nets.errors import UserError
 
@@ -92,7 +92,7 @@ READERS: tuple[Reader, ...] = (
 )
 """The first that recognises a folder reads it."""
 
-_LOOKING_INSIDE: tuple[Reader, ...] = (colmap, scannet, openmvg, strecha)
+_LOOKING_INSIDE: tuple[Reader, ...] = (colmap, scannet, opensfm, openmvg, strecha)
 """Those that recognise folders by what is in folders of theirs, which may be several captures."""
 
 
@@ -117,7 +117,7 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
     """
     path = Path(path)
     if not path.exists():
-        raise UserError("the capture does not exist", path, "check the path")
+        raise UserError("the capture does not exist", path, _meant(path))
     if not path.is_dir() and not path.is_file():
         raise UserError("the capture is not a folder", path, _LAYOUTS)
     try:
@@ -139,6 +139,15 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
         raise UserError(what, Path(error.filename or path), "check its permissions") from error
 
 
+def _meant(path: Path) -> str:
+    """What a path that is not there may have been meant to be."""
+    try:
+        near = get_close_matches(path.name, os.listdir(path.parent), n=1)
+    except OSError:
+        near = []
+    return f"did you mean {path.with_name(near[0])}?" if near else "check the path"
+
+
 def _found_inside(reader: Reader, path: Path) -> bool:
     """Whether a reader may have recognised a folder by a folder in it alone."""
     return reader in _LOOKING_INSIDE and not _holds_model(path)
@@ -150,16 +159,29 @@ def _holds_model(path: Path) -> bool:
 
 
 def _part_of(path: Path) -> UserError | None:
-    """What to say of a capture's folder of photos, or of one: they are what people look for."""
-    if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
-        return None
+    """What to say of a capture's folder of photos, or of a file of it: what people look for."""
     around = Path(os.path.abspath(path)).parent
     for folder in (around, around.parent):
         quick = (reader for reader in READERS if reader not in _LOOKING_INSIDE)
-        if _holds_model(folder) or any(reader.recognises(folder) for reader in quick):
+        if (
+            _holds_model(folder)
+            or any(reader.recognises(folder) for reader in quick)
+            or ((folder == around or path.is_file()) and _has_images_of(folder, path))
+        ):
             what = "this is a part of a capture, which is a folder around it"
             return UserError(what, path, f"name {folder}")
     return None
+
+
+def _has_images_of(folder: Path, path: Path) -> bool:
+    """Whether a folder with a model somewhere in it is a capture of these photos."""
+    try:
+        reader = next((each for each in _LOOKING_INSIDE if each.recognises(folder)), None)
+        frames = {} if reader is None else reader.read(folder).frames
+    except (UserError, OSError):
+        return False
+    whole = Path(os.path.abspath(path))
+    return any(frame.image_path.is_relative_to(whole) for frame in frames.values())
 
 
 def _read(reader: Reader, path: Path, intrinsics: Intrinsics | None) -> Capture:

@@ -20,6 +20,8 @@ from deltas_nets.terminal import progress, warn
 
 LEFT_OUT = {False: "a usable pose", True: "an image"}
 """What frames lack, by whether that is their image."""
+TRUTH = {"": "add depth/N.png", "Robust MVD": "add key/depth.npy"}
+"""What a capture without sensor depth lacks, by its layout; "" is ScanNet's export."""
 FEW = 5
 """Views of a set where nobody asks for more or less."""
 
@@ -92,7 +94,8 @@ def _tell_of_short(found: ChosenViews, wanted: int) -> None:
     count = sum(found.short.values())
     if count:
         why = "; ".join(f"other frames {reason} ({n})" for reason, n in found.short.items())
-        warn(f"{count} of {len(found.view_sets)} view sets have fewer than {wanted} views: {why}")
+        sets = f"{count} of {len(found.view_sets)} view sets"
+        warn(f"{sets} have fewer than {wanted} views that fit: {why}")
 
 
 def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[ViewSet, ...]:
@@ -101,8 +104,7 @@ def with_depth_only(capture: Capture, view_sets: tuple[ViewSet, ...]) -> tuple[V
         views for views in view_sets if capture.frame(views.anchor).depth_path is not None
     )
     if not found:
-        robust_mvd = capture.layout == "Robust MVD"
-        remedy = f"add {'key/depth.npy' if robust_mvd else 'depth/N.png'}"
+        remedy = TRUTH.get(capture.layout, "name one in a format that has it: docs/captures.md")
         raise UserError("the capture has no sensor depth", capture.path, remedy)
     if len(found) < len(view_sets):
         warn(f"{len(view_sets) - len(found)} anchors without sensor depth are not scored")

@@ -25,7 +25,7 @@ class Check(Command):
     poses that are inverted, have other axes or belong to other frames, intrinsics of other images,
     frames that disagree with all others, and more. Nothing is written unless asked for. The exit
     status is 0 where nothing is found, 1 where something is, which may be that a capture cannot be
-    read, and 2 where there is none.
+    read, and 2 where the path leads nowhere.
 
     Example: deltas check my_capture --mend mended_capture
     """

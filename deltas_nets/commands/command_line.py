@@ -74,10 +74,7 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
 
 @contextlib.contextmanager
 def _shown_by(groups: Mapping[str, Sequence[str]]) -> Iterator[None]:
-    """Help that is printed meanwhile is shown by groups, where there are some."""
-    if not groups:
-        yield
-        return
+    """Help that is printed meanwhile is shown by groups."""
     shown = io.StringIO()
     try:
         with contextlib.redirect_stdout(shown):

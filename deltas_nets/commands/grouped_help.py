@@ -34,16 +34,17 @@ def grouped_help(text: str, groups: Mapping[str, Sequence[str]]) -> str:
         groups: options by title, in order; what is in none comes last.
 
     Returns:
-        The text as it is, where no options can be told apart in it.
+        The text as it is, where no options can be told apart in it; or where tyro has them in
+        several boxes and nobody names groups.
     """
     before, *boxes = re.split(r"^(?:╭─| positional arg| options).*$", text, flags=re.MULTILINE)
     options = [option for box in boxes for option in _options(box)]
-    if not options:
+    if not options or (not groups and len(boxes) > 2):
         return text
     width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
     paragraphs = re.split(r"\n\s*\n", before.strip())
     lines = ["\n\n".join("\n".join(wrap(paragraph, width)) for paragraph in paragraphs)]
-    for title, names in {**groups, "more": ()}.items():
+    for title, names in {**groups, "more" if groups else "options": ()}.items():
         listed = {name: place for place, name in enumerate(names)}
         mine = [option for option in options if option.name in listed]
         mine.sort(key=lambda option: listed[option.name])

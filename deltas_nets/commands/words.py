@@ -96,9 +96,16 @@ def _unknown(match: re.Match[str], commands: Mapping[str, type[Command]]) -> str
         near = get_close_matches(first, commands, n=1, cutoff=0.4)
         known = f"did you mean {near[0]}?" if near else f"there are {', '.join(commands)}"
         return f"no command {first}: {known}"
-    meant = re.search(r"Perhaps you meant: (--[\w.-]+)", match.string)
     what = f"no option {first}" if first.startswith("-") else f"{first} is one word too many"
-    return what + (f": did you mean {meant[1]}?" if meant else "")
+    meant = _meant(first, match.string.partition("Perhaps you meant: ")[2])
+    return what + (f": did you mean {meant}?" if meant else "")
+
+
+def _meant(option: str, suggested: str) -> str | None:
+    """Of the options that tyro suggests, of several commands, the nearest of the first one."""
+    known = re.findall(r"(--[\w.-]+) (?:(?! --help).)*? in deltas (\w+) --help", suggested)
+    names = [name for name, command in known if command == known[0][1]]
+    return next(iter([*get_close_matches(option, names, n=1), *names]), None)
 
 
 def _missing(match: re.Match[str], _: Any) -> str:

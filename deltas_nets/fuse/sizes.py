@@ -25,6 +25,8 @@ STD_PER_VOXEL = 3.0
 """A voxel is so much smaller than the deviation of depth: finer ones would show noise."""
 VOXELS_AROUND = 4.0
 """Least truncation, in voxels."""
+COARSEST = 0.02
+"""Of the depth: coarser voxels are not chosen, however unsure the maps are."""
 CELL = 0.02
 """Of the depth: side of the cells by which surfaces are measured."""
 
@@ -88,12 +90,11 @@ def look_at(source: DepthSource, voxel: float | None) -> Sizes:
         what = f"{what} that is sure enough ({source.least_confidence:.2g} or more)"
         remedy = "deltas fuse --min-confidence 0 uses all depth, sure or not"
         raise UserError(what, source.capture.path, remedy)
-    std = float(np.median(stds))
+    std, depth = float(np.median(stds)), float(np.median(depths))
     if voxel is None:
-        voxel = float(f"{max(std / STD_PER_VOXEL, float(np.median(per_pixel))):.2g}")
-    return _measured(
-        voxel, std, float(np.median(depths)), points, origin, len(source.ids) / len(ids)
-    )
+        wanted = min(std / STD_PER_VOXEL, COARSEST * depth)
+        voxel = float(f"{max(wanted, float(np.median(per_pixel))):.2g}")
+    return _measured(voxel, std, depth, points, origin, len(source.ids) / len(ids))
 
 
 def _some_points(view: DepthView, origin: Tensor) -> Tensor:

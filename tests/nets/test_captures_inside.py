@@ -48,3 +48,29 @@ def test_the_only_capture_of_a_folder_is_opened(tmp_path: Path, to: str) -> None
     (tmp_path / "download" / "previews").mkdir()
     outer, inner = (open_capture(tmp_path / "download" / part) for part in ("", "scan"))
     assert outer.layout == inner.layout and list(outer.frames) == list(inner.frames)
+
+
+def test_it_may_lie_three_folders_down_and_no_deeper(tmp_path: Path) -> None:
+    _with(tmp_path / "made", scan="own")
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "made").rename(tmp_path / "a" / "b" / "c")
+    for outer in ("a/b/c", "a/b", "a"):
+        assert open_capture(tmp_path / outer).path == tmp_path / "a/b/c/scan"
+    (tmp_path / "read").rename(tmp_path / "a" / "b" / ".read")
+    with pytest.raises(UserError):
+        open_capture(tmp_path)
+
+
+def test_several_are_named_from_the_folder(tmp_path: Path) -> None:
+    _with(tmp_path / "made", one="own", two="transforms")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "made").rename(tmp_path / "a" / "b")
+    with pytest.raises(UserError, match=r"2 captures \(b/one, b/two\)"):
+        open_capture(tmp_path / "a")
+
+
+def test_a_path_that_is_nearly_right_is_named(tmp_path: Path) -> None:
+    _with(tmp_path, kitchen="own")
+    with pytest.raises(UserError) as error:
+        open_capture(tmp_path / "kitchn")
+    assert error.value.remedy == f"did you mean {tmp_path / 'kitchen'}?"

@@ -145,6 +145,13 @@ def test_voxels_too_fine_are_refused_with_those_that_fit(
     check_memory(look_at(source, float(fitting)), 0.1)
 
 
+def test_unsure_maps_get_voxels_of_a_fiftieth_of_their_depth(maps: tuple[Path, Path]) -> None:
+    for file in (maps[1] / "confidence").glob("*.png"):
+        Image.fromarray(np.full_like(np.array(Image.open(file)), 30)).save(file)
+    sizes = look_at(depth_source(open_capture(maps[0]), maps[1], min_confidence=0), None)
+    assert sizes.voxel == pytest.approx(0.02 * sizes.depth, rel=0.03)
+
+
 @pytest.mark.parametrize("value", [0.0151, 0.0199, 0.02, 0.1, 0.99, 3.01, 1e-6])
 def test_what_is_advised_is_rounded_up(value: float) -> None:
     assert value <= float(_up(value)) < 1.1 * value

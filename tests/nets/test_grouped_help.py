@@ -6,10 +6,12 @@ import pytest
 from run_command import Run
 
 from deltas_nets.cli import COMMANDS
+from deltas_nets.commands import command_line
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.grouped_help import grouped_help
 
 GROUPED = [command for command in COMMANDS if command.groups]
+PLAIN = [command for command in COMMANDS if not command.groups]
 
 BOXES = """usage: deltas it [-h] IN
 
@@ -67,3 +69,26 @@ def test_the_groups_hold_every_option_once(command: type[Command], run: Run) -> 
     listed = re.findall(r"^  (--[a-z-]+|[A-Z]+)\b", shown, flags=re.MULTILINE)
     assert listed == [*names, "--debug"]
     assert "default: None" not in shown and max(map(len, shown.splitlines())) <= 100
+
+
+def test_without_groups_options_stand_in_their_own_order() -> None:
+    shown = grouped_help(BOXES, {})
+    assert shown.index("options:") < shown.index("  IN  ") < shown.index("  --out DIR")
+    assert "default: None" not in shown and "required" not in shown
+
+
+def test_without_groups_several_boxes_of_options_stay() -> None:
+    text = BOXES + BOXES[BOXES.index("╭─ options") :].replace("options ─", "data options ─")
+    assert grouped_help(text, {}) == text
+
+
+@pytest.mark.parametrize("command", PLAIN, ids=lambda command: command.__name__)
+def test_no_option_is_lost(
+    command: type[Command], run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = command.__name__.lower()
+    shown = run(name, "--help").out
+    monkeypatch.setattr(command_line, "grouped_help", lambda text, groups: text)
+    by_tyro = run(name, "--help").out
+    option = re.compile(r"--[a-z][a-z.-]*")
+    assert set(option.findall(shown)) == set(option.findall(by_tyro)) != set()

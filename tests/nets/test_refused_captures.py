@@ -102,10 +102,15 @@ def test_photos_without_poses_are_told_what_finds_them(inside: str, tmp_path: Pa
     assert error.value.where == tmp_path / inside and "frames.json" in error.value.remedy
 
 
-@pytest.mark.parametrize("to", ["own", "colmap", "transforms", "scannet"])
+@pytest.mark.parametrize("to", ["own", "colmap", "colmap elsewhere", "transforms", "scannet"])
 def test_who_names_the_photos_of_a_capture_is_told_the_capture(to: str, tmp_path: Path) -> None:
-    capture = tmp_path / "capture"
-    save_capture(open_capture(write_capture(tmp_path / "in")), capture, to)
+    capture = tmp_path / "captures" / "capture"
+    save_capture(open_capture(write_capture(tmp_path / "in")), capture, to.split()[0])
+    if "elsewhere" in to:
+        (capture / "sparse").rename(capture / "model")
+    # Beside others, one of them known by a file two folders down.
+    (tmp_path / "captures" / "opensfm").mkdir()
+    (tmp_path / "captures" / "opensfm" / "reconstruction.json").write_text("[]")
     photo = next(capture.rglob("*.jpg"))
     for path in (photo.parent, photo):
         with pytest.raises(UserError) as error:
