@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -96,6 +97,8 @@ _LOOKING_INSIDE: tuple[Reader, ...] = (colmap, scannet, opensfm, openmvg, strech
 """Those that recognise folders by what is in folders of theirs, which may be several captures."""
 
 
+_NAMES_LIMIT = 1000
+"""Names that a misspelt one is compared with."""
 _LAYOUTS = (
     "a capture is a COLMAP model, a transforms.json, a frames.json, ScanNet's export or one of "
     f"{len(READERS) - 4} other formats, each with its images: see docs/captures.md"
@@ -142,9 +145,11 @@ def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> C
 def _meant(path: Path) -> str:
     """What a path that is not there may have been meant to be."""
     try:
-        near = get_close_matches(path.name, os.listdir(path.parent), n=1)
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry in islice(entries, _NAMES_LIMIT)]
     except OSError:
-        near = []
+        names = []
+    near = get_close_matches(path.name, names, n=1)
     return f"did you mean {path.with_name(near[0])}?" if near else "check the path"
 
 

@@ -60,7 +60,7 @@ def scanner_app(folder: Path, scene: Scene) -> Written:
     """A scan as it is shared: more poses than photos, depth with what is known of it beside."""
     for i, pose in enumerate(scene.world_from_cam @ OPENGL):
         camera = {
-            "cameraPoseARFrame": pose.ravel().tolist(),
+            "cameraPoseARFrame": [*pose.ravel()[:15].tolist(), 0.99999994],  # as floats are printed
             "intrinsics": [F, 0, CX + 0.5, 0, F, CY + 0.5, 0, 0, 1],
             "projectionMatrix": [1.0] * 16,
             "frame_index": 5 * i,

@@ -17,6 +17,8 @@ __all__ = ["read", "recognises"]
 
 _REMEDY = "in 3D Scanner App share the scan again as All Data"
 _JSON_LIMIT = 2**20
+_ROUNDING = 1e-3
+"""Of what is 0 or 1 in a matrix, as a tracker prints it."""
 
 
 def recognises(path: Path) -> bool:
@@ -56,13 +58,14 @@ def _numbered(path: Path, suffix: str, prefix: str) -> dict[int, Path]:
 def _K(fields: Fields) -> FloatArray:
     """ARKit measures the principal point from the corner of the image."""
     (fx, _, cx), (_, fy, cy), last = fields.numbers("intrinsics", (9,)).reshape(3, 3)
-    if tuple(last) != (0, 0, 1):
+    if not np.allclose(last, (0, 0, 1), atol=_ROUNDING):
         raise fields.error("has intrinsics that are not by rows, with 0 0 1 as the last")
     return camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=fields.path)
 
 
 def _pose(fields: Fields, id: str) -> FloatArray | Lost:
     world_from_cam = fields.numbers("cameraPoseARFrame", (16,), finite=False).reshape(4, 4)
-    if np.isfinite(world_from_cam).all() and tuple(world_from_cam[3]) != (0, 0, 0, 1):
+    last = world_from_cam[3]
+    if np.isfinite(world_from_cam).all() and not np.allclose(last, (0, 0, 0, 1), atol=_ROUNDING):
         raise fields.error("has a cameraPoseARFrame that is not by rows, with 0 0 0 1 as the last")
     return cam_from_world_of(world_from_cam * OPENGL, id=id, path=fields.path)
