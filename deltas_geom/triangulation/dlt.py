@@ -1,10 +1,20 @@
 """The equations that pixels put to points, as rows and as the normal matrix.
 
 A pixel (x, y) of a camera with the rows p1, p2, p3 puts two equations to a homogeneous point X:
-(x p3 - p1) X = 0 and (y p3 - p2) X = 0. Each is multiplied by the pixel's weight. Their stack A has
-the point as its null vector, as nearly as there is one; so has A^T A, the normal matrix.
+(x p3 - p1) X = 0 and (y p3 - p2) X = 0. Their stack is A, each row multiplied by the weight of its
+pixel, which the book has as 1. The point is the X of length 1 that makes the length of A X least:
+of the normal matrix A^T A the eigenvector to the smallest eigenvalue
+(:mod:`deltas_geom.numerics.null_vector`).
 
-Source: Hartley and Zisserman, 2nd ed., section 12.2.
+Multiplied out, a pixel of weight w adds to A^T A
+
+.. math:: w^2 [(x^2 + y^2) p_3^T p_3 - x (p_3^T p_1 + p_1^T p_3) - y (p_3^T p_2 + p_2^T p_3)
+    + p_1^T p_1 + p_2^T p_2]
+
+which is linear in x^2 + y^2, x, y and 1, so what belongs to a camera is found once for all points.
+Many points are solved so, few by the rows, which ``short.py`` stacks as :func:`rows` does.
+
+Source: Hartley and Zisserman, 2nd ed., section 12.2, without weights.
 """
 
 import torch
@@ -30,20 +40,20 @@ def rows(proj: Tensor, pixels: Tensor, weights: Tensor | None = None) -> Tensor:
 def normal_matrix(
     coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor
 ) -> tuple[Tensor, ...]:
-    """A^T W^2 A of the equations and squared weights, upper triangle row by row.
+    """A^T A, the upper triangle row by row.
 
     Args:
-        coefficients: ``(*B, V, 4, K (K + 1) / 2)`` of the cameras, see
+        coefficients: ``(*B, V, 4, D (D + 1) / 2)`` of the cameras, see
             :func:`normal_coefficients`.
         x, y: ``(*B, V, N)`` px.
-        squared: ``(*B, V, N)`` squared weights of the equations, or ``(*B, V, 1)``.
+        squared: ``(*B, V, N)`` squared weights, or ``(*B, V, 1)`` where points are alike.
 
     Returns:
-        K (K + 1) / 2 entries ``(*B, N)``.
+        D (D + 1) / 2 entries ``(*B, N)``.
     """
     if torch.compiler.is_compiling():
         return _by_views(coefficients, x, y, squared)
-    if squared.shape[-1] != x.shape[-1]:
+    if squared.shape[-1] != x.shape[-1]:  # weights of the cameras, which are fewer than points
         of_square, of_x, of_y, of_one = (coefficients * squared.unsqueeze(-1)).unbind(dim=-2)
         factors = torch.cat([of_square, of_x, of_y, of_one.sum(dim=-2, keepdim=True)], dim=-2)
         one = torch.ones_like(x[..., :1, :])
@@ -67,14 +77,14 @@ def _by_views(coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tu
 
 
 def normal_coefficients(proj: Tensor) -> Tensor:
-    """``(*B, V, 4, K (K + 1) / 2)``: every entry of a view's normal matrix is linear in these.
+    """``(*B, V, 4, D (D + 1) / 2)``: every entry of a view's normal matrix is linear in these.
 
     They belong to x^2 + y^2, x, y and 1, whatever the pixel (x, y), so that all points share them.
 
     Args:
-        proj: ``(*B, V, 3, K)`` rows p1, p2, p3, of K = 4 (homogeneous points) or 3 entries.
+        proj: ``(*B, V, 3, D)`` rows p1, p2, p3, of D = 4 (homogeneous points) or 3 entries.
     """
-    outer = proj[..., :, None, :, None] * proj[..., None, :, None, :]  # (*B, V, 3, 3, K, K)
+    outer = proj[..., :, None, :, None] * proj[..., None, :, None, :]  # (*B, V, 3, 3, D, D)
     (e11, _, e13), (_, e22, e23), (e31, e32, e33) = (
         row.unbind(dim=-3) for row in outer.unbind(dim=-4)
     )

@@ -13,13 +13,13 @@ REASONS = (
     Status.TOO_FEW_VIEWS,
     Status.NOT_FINITE_INPUT,
 )
-"""Of several the last one counts."""
+"""Of several the last one counts: without it the question before it has no answer."""
 
 
 def judge(
     *, finite: Tensor, enough: Tensor, posed: Tensor, near: Tensor, in_front: Tensor
 ) -> Tensor:
-    """Status ``(*B, N)`` int8; of several reasons to fail the first one here counts.
+    """Status ``(*B, N)`` int8; of several arguments that are False the first counts.
 
     Args:
         finite: ``(*B, N)`` bool: everything that is used is finite.

@@ -9,7 +9,8 @@ class Encoder(NamedTuple):
     Attributes:
         stages: lite are those of `deltas-small`; paper are the paper's.
         place: "module:name" in `deltas_nets.network`. A lite one is a `LiteEncoder`, a paper's is a
-            `Backbone`; either states its channels and which public weights it can start from.
+            `Backbone` (paper/taps.py); either states its channels and which public weights it can
+            start from.
         package: the Python package whose folder models holds these weights; none if we know none.
     """
 
