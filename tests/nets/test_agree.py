@@ -1,5 +1,6 @@
 """Maps that agree: what one sees from another's place, what most say, who hears whom."""
 
+import itertools
 import math
 from itertools import pairwise
 
@@ -84,6 +85,23 @@ def test_the_nearer_of_two_hides_the_other() -> None:
     seen = seen_from(sure(depth), camera(0.3), camera(0), image_size=SIZE).depth[0, 0]
     assert ((seen - 1).abs() < 1e-9).any() and ((seen - 3).abs() < 1e-9).any()
     assert (((seen - 1).abs() < 1e-9) | ((seen - 3).abs() < 1e-9) | (seen == 0)).all()
+
+
+@given(seeds)
+def test_of_points_of_one_depth_the_surest_is_drawn(seed: int) -> None:
+    random = torch.Generator().manual_seed(seed)
+    depth = torch.full((1, 1, *SIZE), 3.0, dtype=torch.float64)
+    deviation = torch.rand(depth.shape, generator=random).double() + 0.01
+    # From twice as far four points fall on a pixel, all of them 6 m away.
+    seen = seen_from(KnownDepth(depth, deviation), camera(0), camera(0, z=-3.0), image_size=SIZE)
+    wanted = torch.full(SIZE, torch.inf, dtype=torch.float64)
+    for row, column in itertools.product(*map(range, SIZE)):
+        place = math.floor((row + 11.5) / 2 + 0.5), math.floor((column + 15.5) / 2 + 0.5)
+        wanted[place] = torch.minimum(wanted[place], deviation[0, 0, row, column])
+    known = wanted < torch.inf
+    assert known.sum() < depth.numel() / 3
+    assert_close(seen.depth[0, 0], torch.where(known, 6.0, 0.0).double())
+    assert_close(seen.deviation[0, 0], torch.where(known, wanted, 0.0))
 
 
 @given(seeds, st.integers(LEAST, 6))
