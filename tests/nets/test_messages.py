@@ -32,6 +32,7 @@ COMMANDS = (
     "depth --views 3",
     "depth CAPTURE --out CAPTURE",
     "depth CAPTURE --out OUT --vews 3",
+    "depth CAPTURE --view 3",
     "depth CAPTURE --out OUT --views 1",
     "depth CAPTURE --out OUT --shard 3/2",
     "depth CAPTURE --out OUT --size 100",
