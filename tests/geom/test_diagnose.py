@@ -1,5 +1,6 @@
 """``diagnose``: planted faults are named and mended, clean captures raise no alarm."""
 
+import re
 import time
 from typing import Any
 
@@ -26,7 +27,7 @@ from torch import Tensor
 from deltas_geom import PosedViews, ShapeError, diagnose, invert_pose
 from deltas_geom.diagnosis.causes import CURES, Cause
 from deltas_geom.diagnosis.evidence import gather_evidence, residuals
-from deltas_geom.diagnosis.results import Diagnosis
+from deltas_geom.diagnosis.results import Diagnosis, Explanation
 from deltas_geom.testing import seeded_scene
 
 # A diagnosis tries every cause: few examples, of which the first is a pattern that nothing moved.
@@ -129,6 +130,8 @@ def test_the_factor_of_K_is_found(factor: float, capture: Capture) -> None:
     found = diagnosed((of_another_size(K, factor), pose, spoiled(pixels)))
     assert found.cause is Cause.K_OF_OTHER_SIZE and found.factor is not None
     assert abs(found.factor * factor - 1) < 0.01
+    told = re.search(r"which are (\S+) times as large", str(found))
+    assert told is not None and abs(float(told[1]) / factor - 1) < 0.01
 
 
 @pytest.mark.parametrize("factor", [1000.0, 0.01, 0.3048, 1.7])
@@ -149,6 +152,7 @@ def test_half_a_pixel_is_told_from_exact_matches_alone(capture: Capture) -> None
     K, pose, pixels = capture
     exact = diagnosed((K, pose, pixels + 0.5))
     assert exact.cause is Cause.HALF_A_PIXEL and exact.factor == -0.5
+    torch.testing.assert_close(exact.mended.pixels, pixels)
     noisy = diagnosed((K, pose, spoiled(pixels) + 0.5))
     assert noisy.well
     assert Cause.HALF_A_PIXEL in {other.cause for other in noisy.untold}
@@ -285,3 +289,12 @@ def test_it_takes_less_than_a_second() -> None:
         assert diagnosed((K, invert_pose(pose), spoiled(pixels))).cause is Cause.POSES_INVERTED
         taken.append(time.process_time() - start)
     assert min(taken) < 2.0  # s of a core; 0.2 s where it is not shared
+
+
+def test_an_explanation_names_its_cameras_and_its_factor() -> None:
+    swapped = Explanation(Cause.VIEWS_SWAPPED, (1, 2), None, 0.5)
+    assert str(swapped) == "VIEWS_SWAPPED, cameras 1 2: 0.5 px"
+    unit = Explanation(Cause.UNIT_OF_TRANSLATION, (3,), 0.001, 0.25)
+    assert str(unit) == "UNIT_OF_TRANSLATION, camera 3, times 0.001: 0.25 px"
+    shift = Explanation(Cause.HALF_A_PIXEL, (), -0.5, 0.1)
+    assert str(shift) == "HALF_A_PIXEL, -0.5 px: 0.1 px"
