@@ -298,3 +298,15 @@ def test_an_explanation_names_its_cameras_and_its_factor() -> None:
     assert str(unit) == "UNIT_OF_TRANSLATION, camera 3, times 0.001: 0.25 px"
     shift = Explanation(Cause.HALF_A_PIXEL, (), -0.5, 0.1)
     assert str(shift) == "HALF_A_PIXEL, -0.5 px: 0.1 px"
+
+
+def test_one_wrong_camera_is_told_from_all_where_the_others_fit() -> None:
+    # The first camera is the world, so it alone is its own inverse; each other meets it alone.
+    turn = 0.2 * torch.randn(3, 3, generator=seeded()).double()
+    K, pose, pixels = seen_by(turn, ASIDE[:3])
+    pose = pose @ invert_pose(pose[:1])
+    pose[2] = invert_pose(pose[2])
+    mask = torch.ones(pixels.shape[:2], dtype=torch.bool)
+    mask[1, ::2] = mask[2, 1::2] = False
+    found = diagnose(PosedViews(K, pose), pixels, mask=mask)
+    assert found.cause is Cause.POSES_INVERTED and found.cameras == (2,)
