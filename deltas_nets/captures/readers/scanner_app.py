@@ -23,16 +23,16 @@ _ROUNDING = 1e-3
 
 def recognises(path: Path) -> bool:
     """Whether cameras of frames lie in the folder."""
-    return path.is_dir() and bool(_numbered(path, ".json", "frame_"))
+    return bool(numbered_files(path, (".json",), "frame_"))
 
 
 def read(path: Path) -> Capture:
     """Read a scan; see `deltas_nets.captures.opening.Reader` for the contract."""
-    cameras = _numbered(path, ".json", "frame_")
-    images = numbered_files(path, (".jpg", ".jpeg", ".png", ".heic"), "frame_")
+    cameras = numbered_files(path, (".json",), "frame_")
+    images = numbered_files(path, (".jpg", ".jpeg", ".png"), "frame_")
     if not images:
         raise UserError("the scan has cameras and no image", path, _REMEDY)
-    depths = _numbered(path, ".png", "depth_")
+    depths = numbered_files(path, (".png",), "depth_")
     found = Collected(path)
     for number, file in cameras.items():
         if number not in images:
@@ -49,10 +49,6 @@ def read(path: Path) -> Capture:
     if without:
         doubts.append(f"{without} of {len(images)} images have no pose and are left out, {path}")
     return found.capture(path, "3D Scanner App", metric=True, doubts=doubts)
-
-
-def _numbered(path: Path, suffix: str, prefix: str) -> dict[int, Path]:
-    return numbered_files(path, (suffix,), prefix)
 
 
 def _K(fields: Fields) -> FloatArray:
