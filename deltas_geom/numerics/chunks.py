@@ -48,7 +48,7 @@ def cut_points(
     else:  # more at a time are quicker, where no threads can start
         size = _CHUNK if torch.get_num_threads() == 1 else few
     count = tensor.shape[-2]
-    return Cut(_alike(count, size), (0, *dims), outputs) if count > size else None
+    return Cut(alike(count, size), (0, *dims), outputs) if count > size else None
 
 
 def serial_points(tensor: Tensor) -> int:
@@ -59,8 +59,11 @@ def serial_points(tensor: Tensor) -> int:
     return max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
 
 
-def _alike(count: int, size: int) -> int:
-    """Points a chunk: a small one at the end would cost as many calls as a whole one."""
+def alike(count: int, size: int) -> int:
+    """How many of ``count`` points a chunk holds, ``size`` at most.
+
+    All chunks are nearly as long: a small one at the end would cost as many calls as a whole one.
+    """
     return max(1, -(-count // max(1, -(-count // size))))
 
 

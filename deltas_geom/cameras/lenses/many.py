@@ -22,11 +22,12 @@ from torch import Tensor
 from deltas_geom.cameras.lenses.closed import Coefficients
 from deltas_geom.cameras.lenses.models import Model
 from deltas_geom.cameras.lenses.tables import Table, table_of
+from deltas_geom.numerics.chunks import alike
 
 Array = NDArray[Any]
 MANY = 32768
 """Pixels from which on a table is worth being made."""
-_CHUNK = 24576
+_CHUNK = 25600
 _SAMPLED = 512  # pixels, for how far the table goes
 _TOLERANCE = 1e-13
 _Rays = tuple[Tensor, Tensor]
@@ -47,7 +48,7 @@ class RaysOfMany(NamedTuple):
 
     def __call__(self, pixels: Tensor) -> _Rays:
         """Rays ``(*B, N, 3)`` of pixels ``(*B, N, 2)``, and which are valid ``(*B, N)``."""
-        buffers = _Buffers.of(min(_CHUNK, pixels.shape[:-1].numel()))
+        buffers = _Buffers.of(alike(pixels.shape[:-1].numel(), _CHUNK))
         with np.errstate(all="ignore"):
             return _filled(partial(self._some, buffers), pixels)
 
@@ -93,8 +94,9 @@ def _filled(some: Callable[[Tensor, Tensor, Tensor], None], pixels: Tensor) -> _
     """What is written for some pixels at a time; to join parts would take longer than all else."""
     flat = pixels.detach().reshape(-1, 2)
     rays, valid = flat.new_empty(len(flat), 3), flat.new_empty(len(flat), dtype=torch.bool)
-    for start in range(0, len(flat), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    few = alike(len(flat), _CHUNK)
+    for start in range(0, len(flat), few):
+        part = slice(start, start + few)
         some(flat[part], rays[part], valid[part])
     return rays.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
 

@@ -21,13 +21,13 @@ from deltas_geom.numerics.arithmetic import (
     values_at_hand,
     without_autocast,
 )
-from deltas_geom.numerics.chunks import Cut
+from deltas_geom.numerics.chunks import Cut, alike
 from deltas_geom.numerics.evaluation import differentiated, recomputed
 from deltas_geom.numerics.vectors import as_one
 
 _LARGEST = 1e30  # of a coefficient, or a pixel in focal lengths
 _FAR = 1e60  # of a coordinate
-_CACHED = 24576
+_CACHED = 25600
 """Items at a time, so that what lies between stays in the cache and no threads start."""
 _Both = tuple[Tensor, Tensor]
 
@@ -67,7 +67,7 @@ def _through(
     if coefficients.shape[-1]:  # there is no largest of none
         coefficients, sound = finite_or_zero(coefficients, limit=_LARGEST)
     reach = _reach(model, coefficients.detach())
-    few = max(256, _CACHED // max(1, batch.numel()))
+    few = alike(items.shape[-2], max(256, _CACHED // max(1, batch.numel())))
     apart = items.shape[-2] > few and not torch.compiler.is_compiling()
     values, inputs = None, (K, coefficients, reach, items)
     if prepare is not None and known is None and batch.numel() * items.shape[-2] >= MANY:
