@@ -25,9 +25,8 @@ from deltas_nets.captures.usable import usable_view_sets
 from deltas_nets.captures.work_size import depth_at_image, fit_work_size
 from deltas_nets.evaluate.depth_metrics import depth_metrics, mean_metrics
 from deltas_nets.evaluate.scores import resize_nearest
-from deltas_nets.predict.depth_map import PredictConfig, frames_of
+from deltas_nets.predict.depth_map import WORK_PIXELS, PredictConfig, frames_of
 from deltas_nets.predict.look import look
-from deltas_nets.predict.ours import WORK_PIXELS
 from deltas_nets.predict.predictor import load_predictor
 from deltas_nets.predict.reach import ROOM, Reach
 

@@ -42,6 +42,11 @@ class Disturbed:
         """As the network."""
         return self.inner.states_confidence
 
+    @property
+    def takes_larger(self) -> bool:
+        """As the network."""
+        return self.inner.takes_larger
+
     def varied(self, settings: NetworkSettings) -> "Disturbed":
         """The network of other settings, disturbed as this one."""
         return Disturbed(self.inner.varied(settings), self.change)

@@ -20,6 +20,7 @@ class Named(ViewsAlone):
 
     name: str
     states_confidence = False
+    takes_larger = False
 
     @property
     def called(self) -> str:

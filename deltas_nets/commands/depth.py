@@ -1,6 +1,7 @@
 """The command `deltas depth`."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -20,6 +21,7 @@ from deltas_nets.terminal import progress, warn
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
     from deltas_nets.captures.usable import UsableViews
+    from deltas_nets.captures.view_sets import ViewSet
     from deltas_nets.outputs.folder import OutputFolder
     from deltas_nets.outputs.products import OutputOptions
     from deltas_nets.predict.depth_map import PredictConfig
@@ -141,6 +143,8 @@ class Depth(Captured, Measuring, Prediction):
         twice = self.passes > 1 and self.views != 1
         heard = companions(capture, mine, working_depth=depth) if twice else ()
         search = self._search(capture, [views.anchor for views in mine])
+        threads = self._threads(len(mine))
+        config = self._sized(config, predictor, capture, found.view_sets, search, threads)
         folder = self._folder(capture, found, shard, options, predictor, config)
         outcome = predict_capture(
             predictor,
@@ -152,7 +156,7 @@ class Depth(Captured, Measuring, Prediction):
             search=search,
             short=found.short,
             passes=self.passes,
-            threads=self._threads(len(mine)),
+            threads=threads,
             progress=progress,
         )
         tell(outcome, folder, options, self.format)
@@ -173,6 +177,29 @@ class Depth(Captured, Measuring, Prediction):
         if self.depth_range is None:
             return Followed(capture, measured)
         return Asked(capture, self.depth_range, measured)
+
+    def _sized(
+        self,
+        config: "PredictConfig",
+        predictor: "Predictor",
+        capture: "Capture",
+        view_sets: Sequence["ViewSet"],
+        search: "Search",
+        threads: int,
+    ) -> "PredictConfig":
+        """With the size at which the network is surest, unless one is given or depth is."""
+        from deltas_nets.predict.trial import TRIED, surest_config
+
+        if self.work_size is not None or self.views == 1 or self.sensor_depth is not None:
+            return config
+        count = min(TRIED, len(view_sets))
+        with progress("size of images", count) as report:
+            found = surest_config(
+                predictor, capture, view_sets, config, search, threads=threads, report=report
+            )
+        if found != config:
+            print("larger images are as sure: maps take longer (--work-size)")
+        return found
 
     def _threads(self, maps: int) -> int:
         """Maps at once: a core each, as cores that share a map wait for each other."""

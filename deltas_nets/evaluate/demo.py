@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from deltas_nets import __version__
-from deltas_nets.captures.motorcycle import motorcycle
+from deltas_nets.captures.motorcycle import StereoPair, motorcycle
 from deltas_nets.config import to_dict
 from deltas_nets.cost.stages import Lap, timed_stages
 from deltas_nets.evaluate.depth_metrics import depth_metrics
@@ -23,6 +23,7 @@ from deltas_nets.outputs.products import FrameOutput
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import predict_frame
+from deltas_nets.predict.trial import surer, with_larger_images
 
 STAGES = ("encoder", "detector", "descriptor", "matcher", "densifier")
 BETWEEN = "triangulation and sparse depth"
@@ -36,7 +37,9 @@ def run_demo(
     Raises:
         UserError: the folder cannot be written, or scikit-image carries no pair.
     """
-    pair = motorcycle()
+    pair, encode = motorcycle(), EncodedFrames(model)
+    if config.work_size is None:
+        config = surer(config, [_gain(encode, pair, config)])
     folder = prepare_output(
         out,
         settings={
@@ -51,7 +54,7 @@ def run_demo(
     )
     started = time.perf_counter()
     with timed_stages(model) as laps:
-        result = predict_frame(EncodedFrames(model), [pair.left, pair.right], config)
+        result = predict_frame(encode, [pair.left, pair.right], config)
     elapsed = time.perf_counter() - started
     seconds = _seconds_by_stage(laps)
     dense = depth_metrics(result.map.depth, pair.depth, depth_range=config.depth_range)
@@ -84,6 +87,16 @@ def run_demo(
     console.print(f"sparse median error {100 * median:.2f} %")
     console.print(_stage_table(seconds))
     console.print(f"figure in {figure}, depth in {folder.file('depth', 'left')}", soft_wrap=True)
+
+
+def _gain(encode: EncodedFrames, pair: StereoPair, config: PredictConfig) -> float:
+    """Confidence that larger images add to the map."""
+    usual, large = (
+        predict_frame(encode, [pair.left, pair.right], each).map.confidence
+        for each in (config, with_larger_images(config))
+    )
+    assert usual is not None and large is not None  # a network of deltas states it
+    return float(large.mean() - usual.mean())
 
 
 def _seconds_by_stage(laps: Sequence[Lap]) -> dict[str, float]:

@@ -33,6 +33,7 @@ class DensePredictor(ViewsAlone):
     """
 
     states_confidence = True
+    takes_larger = False
 
     def __init__(self, model: CostVolume) -> None:
         self.model = model

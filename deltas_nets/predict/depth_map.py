@@ -16,6 +16,9 @@ from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.prediction import DepthPrediction
 
+WORK_PIXELS = 120_000
+"""Pixels of the image that the network usually sees; see decisions 5 and 26."""
+
 
 @dataclass(frozen=True)
 class PredictConfig:
@@ -25,6 +28,8 @@ class PredictConfig:
     """Nearest and farthest depth searched, metres."""
     work_size: tuple[int, int] | None = None
     """(height, width) that the network sees; chosen to suit it if not given."""
+    work_pixels: int = WORK_PIXELS
+    """How many pixels that has at most, where it is chosen."""
     size: tuple[int, int] | None = None
     """(height, width) of the maps; the colour image's own if not given."""
     min_confidence: float = 0.0

@@ -14,9 +14,10 @@ from deltas_nets.captures.images import Span
 from deltas_nets.captures.work_size import load_image
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.encoded import Encoded
+from deltas_nets.predict.depth_map import WORK_PIXELS
 
 CAPACITY = 24
-"""Frames that are kept: 15 MB each at the default size."""
+"""Frames that are kept, of 120 000 pixels, which take 15 MB each; of larger ones fewer."""
 
 _Key = tuple[Path, Span | None, tuple[int, int]]
 
@@ -65,12 +66,16 @@ class EncodedFrames:
             for key in keys:
                 self._known[key] = views[key]
                 self._known.move_to_end(key)
-            while len(self._known) > self.capacity:
+            while self._full():
                 self._known.popitem(last=False)
         return EncodedImages(
             torch.stack([views[key].images for key in keys]),
             Encoded.joined([views[key].encoded for key in keys]),
         )
+
+    def _full(self) -> bool:
+        pixels = sum(height * width for *_, (height, width) in self._known)
+        return len(self._known) > self.capacity or pixels > self.capacity * WORK_PIXELS
 
     def _view(self, key: _Key, frame: Frame) -> EncodedImages:
         """A frame encoded, by one thread while others that want it wait."""

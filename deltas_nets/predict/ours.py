@@ -31,8 +31,9 @@ from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.without_points import map_without_points
 from deltas_nets.weights_file import weights_record
 
-WORK_PIXELS = 120_000
-"""Pixels of the image that the network sees, unless a size is given; see decision 5."""
+POINT_PIXELS = 192
+"""Pixels of an image for each point of a network with 768: of more pixels there are more points, or
+the densifier has too few of them; see decision 26."""
 
 
 class FrameDepth(NamedTuple):
@@ -62,6 +63,11 @@ class DeltasPredictor:
     """
 
     states_confidence = True
+
+    @property
+    def takes_larger(self) -> bool:
+        """If it looks for points, of which a larger image has more."""
+        return not self.without_points
 
     def __init__(self, model: Deltas, *, without_points: bool = False) -> None:
         self.encode = EncodedFrames(model)
@@ -146,7 +152,12 @@ def predict_frame(
     known = None if measured is None else known_depth(anchor, measured, work_size).to(device)
     prediction = with_batch_dims(
         encode.model.from_encoded(
-            encoded, of_one, config.depth_range, image_size=work_size, known=known
+            encoded,
+            of_one,
+            config.depth_range,
+            image_size=work_size,
+            num_keypoints=num_points(encode.model, work_size),
+            known=known,
         ),
         torch.Size(),
     )
@@ -179,8 +190,14 @@ def complete_frame(
 
 def work_size_of(anchor: Frame, config: PredictConfig) -> tuple[int, int]:
     """(height, width) that the network sees."""
-    most = round(WORK_PIXELS * anchor.extent)
+    most = round(config.work_pixels * anchor.extent)
     return config.work_size or fit_work_size(anchor.image_size, max_pixels=most)
+
+
+def num_points(model: Deltas, work_size: tuple[int, int]) -> int:
+    """How many points are looked for in an image of (height, width): the config's, or more."""
+    usual: int = model.config.detector.num_keypoints
+    return max(usual, round(usual * work_size[0] * work_size[1] / (POINT_PIXELS * 768)))
 
 
 def known_depth(anchor: Frame, measured: MeasuredDepth, work_size: tuple[int, int]) -> KnownDepth:

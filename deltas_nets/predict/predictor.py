@@ -31,6 +31,10 @@ class Predictor(Protocol):
     def states_confidence(self) -> bool:
         """Whether maps come with a confidence."""
 
+    @property
+    def takes_larger(self) -> bool:
+        """Whether its confidence tells how large it should see a capture's images."""
+
     def check_asked(
         self, config: PredictConfig, capture: Capture, view_sets: Sequence[ViewSet]
     ) -> None:

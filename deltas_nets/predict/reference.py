@@ -87,6 +87,7 @@ class ReferencePredictor(ViewsAlone):
     """
 
     states_confidence = False
+    takes_larger = False
     called = "the reference network"
 
     def __init__(self, network: ReferenceNetwork, settings: NetworkSettings = PUBLISHED) -> None:
