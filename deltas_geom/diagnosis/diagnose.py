@@ -5,7 +5,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import ShapeError, check_bool, check_positive, check_shapes
+from deltas_geom.checks import ShapeError, check_batch, check_bool, check_positive
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
 from deltas_geom.diagnosis.hypotheses import Hypothesis, resized
@@ -92,12 +92,15 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
 
 def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: float) -> Tensor:
     """``(V, N)`` what is observed and finite."""
-    batch = views.check_shapes()
-    check_shapes(K=(views.K, "V 3 3"), pixels=(pixels, "V N 2"))
-    if mask is not None:
-        check_shapes(pixels=(pixels, "V N 2"), mask=(mask, "V N"))
-        check_bool(mask=mask)
-    if len(batch) or pixels.ndim > 3 or (mask is not None and mask.ndim > 2):
+    views.check_shapes()
+    batch = check_batch(
+        K=(views.K, "V 3 3"),
+        cam_from_world=(views.cam_from_world, "V 4 4"),
+        pixels=(pixels, "V N 2"),
+        mask=(mask, "V N"),
+    )
+    check_bool(mask=mask)
+    if batch:
         raise ShapeError("diagnose takes one set of views: no batch dims")
     if views.num_views < 2:
         raise ShapeError(f"diagnose needs 2 views or more, got {views.num_views}")

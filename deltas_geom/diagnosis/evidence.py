@@ -93,16 +93,16 @@ def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHA
         pose: ``(V, 4, 4)`` cam_from_world.
         share: of a pair's matches must be within the distance.
     """
-    off = _off(evidence, K, pose)
-    return _quantile(torch.maximum(*off.chunk(2)), evidence.counts, share).clamp(max=CAP)
+    off = torch.maximum(*_off(evidence, K, pose).chunk(2))
+    rank = ((evidence.counts * share).ceil().long() - 1).clamp(min=0)
+    return off.sort(dim=-1).values.gather(-1, rank[:, None])[:, 0].clamp(max=CAP)
 
 
 def displacements(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
     """Distance from points at infinity that 45 % of a pair's matches keep within, ``(P)``."""
     still = pose.clone()
     still[:, :3, 3] = 0
-    off = torch.maximum(*_off(evidence, K, still).chunk(2))
-    return _quantile(off, evidence.counts, share=0.45).clamp(max=CAP)
+    return residuals(evidence, K, still, share=0.45)
 
 
 def _off(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
@@ -153,8 +153,3 @@ def inverse_up_to_scale(K: Tensor) -> Tensor:
     sign = (x * columns[0]).sum(dim=-1).sign()
     inverse: Tensor = torch.stack(columns, dim=-1) * sign[:, None, None]
     return inverse
-
-
-def _quantile(errors: Tensor, counts: Tensor, share: float = SHARE) -> Tensor:
-    rank = ((counts * share).ceil().long() - 1).clamp(min=0)
-    return errors.sort(dim=-1).values.gather(-1, rank[:, None])[:, 0]

@@ -96,16 +96,12 @@ def explains(given: Trial, trial: Trial, threshold: float, *, on: Tensor | None 
     """
     on = trial.concerned if on is None else on
     # All matches of some of many pairs may be wrong; of one camera's few pairs all count.
-    of = level if bool(on.all()) else _mean
-    before, after = of(given.residual[on]), of(trial.residual[on])
+    of = level if bool(on.all()) else torch.mean
+    before, after = float(of(given.residual[on])), float(of(trial.residual[on]))
     if before > threshold and after <= min(0.5 * before, threshold):
         return True
     enough = after <= min(0.25 * before, 2 * threshold) and before - after > 0.5 * threshold
     return enough or (before > _EXACT and after <= 0.1 * before)
-
-
-def _mean(residual: Tensor) -> float:
-    return float(residual.mean())
 
 
 def level(residual: Tensor) -> float:
@@ -116,10 +112,5 @@ def level(residual: Tensor) -> float:
 
 def by_camera(residual: Tensor, evidence: Evidence, views: int) -> Tensor:
     """``(V)`` px, the mean of each camera's pairs."""
-    means = [
-        residual[evidence.with_camera(camera)].mean()
-        if bool(evidence.with_camera(camera).any())
-        else residual.new_tensor(torch.nan)
-        for camera in range(views)
-    ]
-    return torch.stack(means)
+    # The mean of none is NaN.
+    return torch.stack([residual[evidence.with_camera(view)].mean() for view in range(views)])

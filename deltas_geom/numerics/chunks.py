@@ -8,7 +8,7 @@ from torch import Tensor
 
 from deltas_geom.numerics.sums import SERIAL
 
-_CHUNK, _SMALLEST_CHUNK = 16384, 512  # points
+_SMALLEST_CHUNK = 512  # points
 
 
 class Cut(NamedTuple):
@@ -26,9 +26,7 @@ class Cut(NamedTuple):
     outputs: tuple[int, ...]
 
 
-def cut_points(
-    tensor: Tensor, *dims: int, outputs: tuple[int, ...], parts: bool = False
-) -> Cut | None:
+def cut_points(tensor: Tensor, *dims: int, outputs: tuple[int, ...]) -> Cut | None:
     """A cut for cameras and what is known of points, of which ``tensor`` ``(*B, V, N, K)`` tells N.
 
     Args:
@@ -36,27 +34,14 @@ def cut_points(
             operation on all their views starts threads.
         *dims: of the inputs after the cameras.
         outputs: of the outputs.
-        parts: will the function itself take some points at a time where it looks at views?
     """
     # A compiler fuses what lies between instead, and may not know the number of points.
     if torch.compiler.is_compiling():
         return None
-    few = serial_points(tensor)
-    whole = _CHUNK // max(1, tensor.shape[:-3].numel())
-    if parts:
-        size = few * max(1, round(whole / few))
-    else:  # more at a time are quicker, where no threads can start
-        size = _CHUNK if torch.get_num_threads() == 1 else few
+    # The same however many threads torch may start: a pass costs what it costs with one.
+    size = max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
     count = tensor.shape[-2]
     return Cut(alike(count, size), (0, *dims), outputs) if count > size else None
-
-
-def serial_points(tensor: Tensor) -> int:
-    """How many points of ``(*B, V, N, K)`` all operations on their views compute in one thread.
-
-    The same however many threads torch may start: a pass costs what it costs with one.
-    """
-    return max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
 
 
 def alike(count: int, size: int) -> int:

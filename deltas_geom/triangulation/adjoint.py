@@ -7,8 +7,6 @@ product of the errors of x and of y, whose derivatives by pixels, weights and ca
 Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 15 (implicit functions).
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -17,38 +15,9 @@ from deltas_geom.numerics.null_vector import solve_in_complement
 from deltas_geom.numerics.sums import over_points, product
 from deltas_geom.numerics.vectors import Vector3, Vector4, as_one, dot, either, minus, scaled
 from deltas_geom.triangulation.equations import Equations, Rig, out_of_frame
-from deltas_geom.triangulation.observed import Observations, homogeneous_in_views, inverted
+from deltas_geom.triangulation.observed import Observations, homogeneous_in_views
 from deltas_geom.triangulation.solution import of_length_one, of_trace_one
 from deltas_geom.triangulation.weights import Weights
-
-
-class Gradients(NamedTuple):
-    """Of the sum of gradient * points; broadcast as the inputs were.
-
-    Attributes:
-        proj: ``(*B, V, 3, 4)``, or None where not asked for.
-        pixels: ``(*B, V, N, 2)``.
-        weights: ``(*B, V, N)``, or None where there are none.
-    """
-
-    proj: Tensor | None
-    pixels: Tensor
-    weights: Tensor | None
-
-
-class _Pull(NamedTuple):
-    """What of the points' gradient reaches the equations.
-
-    Attributes:
-        place: four ``(*B, N)``: the points, homogeneous, from the datum.
-        push: four ``(*B, N)``: y as such a point.
-        framed: five ``(*B, N)``, of 1, the squared distance of a camera from the datum and its
-            three coordinates: the gradient by a view's squared weight, through the frame.
-    """
-
-    place: Vector4
-    push: Vector4
-    framed: tuple[Tensor, ...]
 
 
 def gradients_of(
@@ -60,8 +29,8 @@ def gradients_of(
     weights: Tensor | None,
     of_cameras: bool,
     dtype: torch.dtype,
-) -> Gradients:
-    """Gradients of what the equations were made of, to first order.
+) -> tuple[Tensor | None, Tensor, Tensor | None]:
+    """Of the sum of gradient * points, to first order, by what the equations were made of.
 
     Args:
         equations: of N points.
@@ -71,37 +40,27 @@ def gradients_of(
         weights: ``(*B, V, N)`` as they were given; None if they need no gradient.
         of_cameras: are those by the cameras wanted, too?
         dtype: of the pixels.
+
+    Returns:
+        ``(*B, V, 3, 4)`` or None, ``(*B, V, N, 2)``, ``(*B, V, N)`` or None; broadcast as the
+        inputs were.
     """
-    pull = _pulled(equations, vector, valid, gradient)
-    rig, sums = equations.rig, []
-
-    def of_part(part: Observations, *rows: Tensor) -> tuple[Tensor, ...]:
-        x, y, known = part
-        place, push, framed, signs = rows[:4], rows[4:8], rows[8:13], rows[13:]
-        (a, b, c), (d, e, f) = (homogeneous_in_views(rig.near, some) for some in (place, push))
-        across, down, along, below = x * c - a, y * c - b, x * f - d, y * f - e
-        by_x = torch.addcmul(f * across, c, along) * -known.squared
-        by_y = torch.addcmul(f * down, c, below) * -known.squared
-        found: tuple[Tensor, ...] = (as_one((by_x, by_y), dtype),)
-        if signs:
-            by_weight = product(rig.moments[0].mT, torch.stack(framed, dim=-2))
-            by_weight = by_weight - torch.addcmul(across * along, down, below)
-            found = (*found, (by_weight * _slope(known, signs[0])).to(signs[0].dtype))
-        if of_cameras:
-            stacked = [torch.stack(some, dim=-2) for some in (place, push, framed[1:])]
-            sums.append(_over_points(part, (across, down), (along, below), *stacked))
-        return found
-
-    rows = (*pull.place, *pull.push, *pull.framed)
-    if weights is None:
-        pixels, *by_weights = equations.each(of_part, *rows, dims=(-2,))
-    else:
-        pixels, *by_weights = equations.each(of_part, *rows, weights, dims=(-2, -1))
-    proj = None
+    place, push, framed = _pulled(equations, vector, valid, gradient)
+    rig, (x, y, known) = equations.rig, equations.observed
+    (a, b, c), (d, e, f) = (homogeneous_in_views(rig.near, some) for some in (place, push))
+    across, down, along, below = x * c - a, y * c - b, x * f - d, y * f - e
+    by_x = torch.addcmul(f * across, c, along) * -known.squared
+    by_y = torch.addcmul(f * down, c, below) * -known.squared
+    proj = by_weight = None
+    if weights is not None:
+        by_square = product(rig.moments[0].mT, torch.stack(framed, dim=-2))
+        by_square = by_square - torch.addcmul(across * along, down, below)
+        by_weight = (by_square * _slope(known, weights)).to(weights.dtype)
     if of_cameras:
-        near, centers = (sum(some[1:], some[0]) for some in zip(*sums, strict=True))
-        proj = _of_cameras(rig, near, centers)
-    return Gradients(proj, pixels, by_weights[0] if by_weights else None)
+        stacked = [torch.stack(some, dim=-2) for some in (place, push, framed[1:])]
+        sums = _over_points(equations.observed, (across, down), (along, below), *stacked)
+        proj = _of_cameras(rig, *sums)
+    return proj, as_one((by_x, by_y), dtype), by_weight
 
 
 def _slope(known: Weights, weights: Tensor) -> Tensor:
@@ -126,7 +85,15 @@ def _over_points(
     return torch.stack(near, dim=-2), over_points(known.squared.expand_as(u), framed)
 
 
-def _pulled(equations: Equations, vector: Vector4, valid: Tensor, gradient: Vector3) -> _Pull:
+def _pulled(
+    equations: Equations, vector: Vector4, valid: Tensor, gradient: Vector3
+) -> tuple[Vector4, Vector4, tuple[Tensor, ...]]:
+    """What of the points' gradient reaches the equations.
+
+    The points and y, homogeneous, from the datum, four ``(*B, N)`` each; and five, of 1, the
+    squared distance of a camera from the datum and its three coordinates: the gradient by a view's
+    squared weight, through the frame.
+    """
     frame = equations.frame
     matrix, share = of_trace_one(equations.normal, valid)
     g, x = either(valid, gradient, (0.0,) * 3), of_length_one(vector, valid)
@@ -143,7 +110,7 @@ def _pulled(equations: Equations, vector: Vector4, valid: Tensor, gradient: Vect
     constant = beta * (dot(frame.origin, frame.origin) - frame.unit.square())
     constant = constant - dot(alpha, frame.origin)
     framed = (constant, beta, *minus(alpha, 2 * beta, frame.origin))
-    return _Pull(out_of_frame(frame, x), out_of_frame(frame, y), framed)
+    return out_of_frame(frame, x), out_of_frame(frame, y), framed
 
 
 def _of_cameras(rig: Rig, near: Tensor, centers: Tensor) -> Tensor:
@@ -152,8 +119,7 @@ def _of_cameras(rig: Rig, near: Tensor, centers: Tensor) -> Tensor:
     rows, last = near[..., :3], near[..., 3:]
     offset = cameras.centers - datum
     center = centers[..., 1:] + 2 * offset * centers[..., :1]
-    inverse, _ = inverted(cameras.proj[..., :3])
-    position = -(inverse * center.unsqueeze(-1)).sum(dim=-2)
+    position = -(cameras.inverse * center.unsqueeze(-1)).sum(dim=-2)
     position = position.unsqueeze(-1)  # by the last column, and through it by the others
     rows = rows + last * datum.unsqueeze(-2) + position * cameras.centers.unsqueeze(-2)
     found = torch.cat([rows, last + position], dim=-1)

@@ -13,6 +13,7 @@ from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
 from deltas_geom.numerics.vectors import Vector3, dot, minus, scaled
+from deltas_geom.triangulation.observed import finite_cameras
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
 from deltas_geom.triangulation.rig_frame import datum_of
 from deltas_geom.triangulation.solution import in_world, kept
@@ -77,28 +78,26 @@ def see_rays(
     """Tell used rays ``(*B, V, N, 3)`` of cameras ``(*B, V, 4, 4)`` from others."""
     work = solver_dtype(rays)
     batch = check_bearings(cam_from_world, rays, weights, mask)
-    pose = cam_from_world[..., :3, :].to(work)  # whatever the last row
+    pose, broken = finite_cameras(cam_from_world[..., :3, :])  # whatever the last row
     x, y, z = (one.to(work, memory_format=torch.contiguous_format) for one in rays.unbind(dim=-1))
     with torch.no_grad():
-        # Squares of what is let through can be represented. NaN is not let through.
-        posed = (pose.abs() < torch.finfo(work).max ** 0.25).all(-1).all(-1)
         length = _largest((x, y, z))
         sound = (length > 0) & (length <= torch.finfo(work).max)
     # Double where throughout: what is not used must pass no gradient and no NaN.
-    pose = torch.where(posed[..., None, None], pose, 0.0)
     # Divided by its largest coordinate it cannot overflow when squared.
     ray = tuple(safe_divide(one, length, sound) for one in (x, y, z))
     rows = pose[..., :3].unsqueeze(-2).unbind(dim=-3)  # each (*B, V, 1, 3)
     ray = tuple(dot(ray, tuple(row[..., i] for row in rows)) for i in range(3))
     square = dot(ray, ray)
     # A pose that is no rotation may turn a ray into nothing.
-    sound = sound & posed.unsqueeze(-1) & (square.detach() > torch.finfo(work).tiny ** 0.4)
+    sound = sound & (broken == 0).unsqueeze(-1) & (square.detach() > torch.finfo(work).tiny ** 0.4)
     every = surely_all(sound)
     inverse = square.rsqrt() if every else torch.where(sound, square, 1.0).rsqrt()
     centers = -(pose[..., :3] * pose[..., 3:]).sum(dim=-2)
     weighed = weigh(weights, mask, batch=batch, like=rays, sound=None if every else sound)
-    broken, datum = (~posed).to(work), datum_of(centers)
-    return Bearings(centers, datum, broken, scaled(ray, inverse), sound, weighed, rays.dtype)
+    return Bearings(
+        centers, datum_of(centers), broken, scaled(ray, inverse), sound, weighed, rays.dtype
+    )
 
 
 def describe_rays(

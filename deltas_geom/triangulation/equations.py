@@ -1,20 +1,17 @@
 """The equations of pixels, each point's in its own frame."""
 
-from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all
-from deltas_geom.numerics.chunks import joined
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     Cameras,
     Observations,
-    cameras_of,
     homogeneous_in_views,
 )
 from deltas_geom.triangulation.reprojection import in_views
@@ -27,7 +24,6 @@ from deltas_geom.triangulation.rig_frame import (
     rig_frame,
     rig_sums,
 )
-from deltas_geom.triangulation.short import ShortRig
 from deltas_geom.triangulation.weights import weigh
 
 Frame = Literal["rig", "world"]
@@ -58,7 +54,7 @@ class Equations(NamedTuple):
         rig: the cameras.
         frame: in which each point is solved.
         normal: ten ``(*B, N)``, in that frame.
-        parts: what is seen of the points, some at a time.
+        observed: what is seen of the points.
         dtype: of the inputs.
         fixed: the frame is the world's: it depends on no camera and no weight.
     """
@@ -66,7 +62,7 @@ class Equations(NamedTuple):
     rig: Rig
     frame: RigFrame
     normal: Symmetric4
-    parts: Sequence[Observations]
+    observed: Observations
     dtype: torch.dtype
     fixed: bool
 
@@ -77,64 +73,24 @@ class Equations(NamedTuple):
 
     def product(self, x: Vector4) -> Vector4:
         """As of :class:`Linear`."""
-        near, origin = self.rig.near, self.frame.origin
-
-        def summed(part: Observations, *place: Tensor) -> tuple[Tensor, ...]:
-            x, y, weights = part
-            a, b, c = homogeneous_in_views(near, place)
-            across, down = (x * c - a) * weights.squared, (y * c - b) * weights.squared
-            sums = torch.stack([-across, -down, x * across + y * down], dim=-2).flatten(-3, -2)
-            return over_views(near.flatten(-3, -2).mT, sums)
-
-        *sums, last = self.each(summed, *out_of_frame(self.frame, x))
-        return (*sums, (dot(origin, tuple(sums)) + last) / self.frame.unit)
+        near, (px, py, weights) = self.rig.near, self.observed
+        a, b, c = homogeneous_in_views(near, out_of_frame(self.frame, x))
+        across, down = (px * c - a) * weights.squared, (py * c - b) * weights.squared
+        errors = torch.stack([-across, -down, px * across + py * down], dim=-2).flatten(-3, -2)
+        *sums, last = over_views(near.flatten(-3, -2).mT, errors)
+        return (*sums, (dot(self.frame.origin, tuple(sums)) + last) / self.frame.unit)
 
     def in_front(self, points: Vector3) -> Tensor:
         """As of :class:`Linear`."""
         # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-        row = self.rig.near[..., 2, :]
-
-        def nearest(part: Observations, *points: Tensor) -> tuple[Tensor]:
-            depth, unused = in_views(row, points), part.weights.unused
-            if not surely_all(~unused):
-                depth = torch.where(unused, 1.0, depth)
-            return (depth.amin(dim=-2),)
-
-        return self.each(nearest, *points)[0] > 0
-
-    def each(
-        self,
-        function: Callable[..., tuple[Tensor, ...]],
-        *points: Tensor,
-        dims: Sequence[int] | None = None,
-    ) -> tuple[Tensor, ...]:
-        """``function(part, *points)`` of points ``(..., N)``, part by part, its results joined.
-
-        Along the last dim, or the ``dims`` given.
-        """
-        if len(self.parts) == 1:
-            return function(self.parts[0], *points)
-        found, start = [], 0
-        for part in self.parts:
-            count = part.x.shape[-1]
-            found.append(function(part, *(tensor.narrow(-1, start, count) for tensor in points)))
-            start += count
-        columns = list(zip(*found, strict=True))
-        return tuple(map(joined, columns, dims or [-1] * len(columns)))
+        depth, unused = in_views(self.rig.near[..., 2, :], points), self.observed.weights.unused
+        if not surely_all(~unused):
+            depth = torch.where(unused, 1.0, depth)
+        return depth.amin(dim=-2) > 0
 
 
-def rig_of(proj: Tensor) -> Rig:
+def rig_of(cameras: Cameras) -> Rig:
     """All that is needed of cameras ``(*B, V, 3, 4)``."""
-    return _rig(cameras_of(proj))
-
-
-def rig_like(known: ShortRig) -> Rig:
-    """The same from what the short way needs, which is found faster."""
-    proj, finite, centers = map(torch.from_numpy, (known.proj, known.finite, known.centers))
-    return _rig(Cameras(proj, (~finite).double(), centers))
-
-
-def _rig(cameras: Cameras) -> Rig:
     rows, datum = cameras.proj[..., :3], datum_of(cameras.centers)
     # Of M (x - centre): nothing cancels, wherever the world's origin is.
     moved = cameras.proj[..., 3:] + (rows * datum.unsqueeze(-2)).sum(dim=-1, keepdim=True)
@@ -166,7 +122,7 @@ def alike_of(rig: Rig, frame: Frame, dtype: torch.dtype) -> Alike:
 
 def equations_of(
     rig: Rig,
-    parts: Sequence[Observations],
+    observed: Observations,
     *,
     frame: Frame,
     dtype: torch.dtype,
@@ -176,26 +132,20 @@ def equations_of(
 
     Args:
         rig: of the cameras.
-        parts: pixels and weights, of some points each.
+        observed: pixels and weights.
         frame: "rig" or "world".
         dtype: of the inputs.
         alike: of points without weights and mask.
     """
-    (sound,) = _of_all([(part.weights.sound,) for part in parts], parts)
+    x, y, weights = observed
     if alike is None:
-        sums = zip(*(rig_sums(rig.moments, part.weights) for part in parts), strict=True)
-        weighted, counted = (_of_all(list(rows), parts) for rows in sums)
-        framed = _framed(rig, (weighted, counted), frame, dtype)
-    else:
-        framed = alike.frame
-    coefficients = rig.coefficients if alike is None else alike.coefficients
-    made = [normal_matrix(coefficients, x, y, weights.squared) for x, y, weights in parts]
-    normal = _of_all(made, parts)
-    if alike is None:
-        held = framed.held()
+        framed = _framed(rig, rig_sums(rig.moments, weights), frame, dtype)
+        held, normal = framed.held(), normal_matrix(rig.coefficients, x, y, weights.squared)
         normal = in_frame(normal, held.origin, held.unit)
-    framed = framed._replace(finite=framed.finite & sound)
-    return Equations(rig, framed, normal, parts, dtype, frame == "world")
+    else:
+        framed, normal = alike.frame, normal_matrix(alike.coefficients, x, y, weights.squared)
+    framed = framed._replace(finite=framed.finite & weights.sound)
+    return Equations(rig, framed, normal, observed, dtype, frame == "world")
 
 
 def _framed(
@@ -206,19 +156,6 @@ def _framed(
         return found
     origin = tuple(-place.expand_as(found.unit) for place in rig.datum.unbind(dim=-1))
     return found._replace(origin=origin, unit=torch.ones_like(found.unit))
-
-
-def _of_all(
-    rows: Sequence[tuple[Tensor, ...]], parts: Sequence[Observations]
-) -> tuple[Tensor, ...]:
-    """Rows of all points from those of each part; one column where all points are alike."""
-    if len(rows) == 1 or all(some[0].shape[-1] == 1 for some in rows):
-        return rows[0]
-    counts = [part.x.shape[-1] for part in parts]
-    return tuple(
-        joined([row.expand(*row.shape[:-1], n) for row, n in zip(some, counts, strict=True)], -1)
-        for some in zip(*rows, strict=True)
-    )
 
 
 def cameras_in_frame(proj: Tensor, frame: RigFrame) -> Tensor:

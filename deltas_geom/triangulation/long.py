@@ -15,7 +15,7 @@ from deltas_geom.numerics.vectors import Vector3, as_one
 from deltas_geom.triangulation.adjoint import gradients_of
 from deltas_geom.triangulation.equations import Equations, Frame, Rig, alike_of, equations_of
 from deltas_geom.triangulation.judge import ok
-from deltas_geom.triangulation.observed import Observations, in_parts
+from deltas_geom.triangulation.observed import observe
 from deltas_geom.triangulation.reprojection import (
     mean_of,
     parallax_of,
@@ -67,42 +67,33 @@ class LongWay:
 
     def see(self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None) -> Equations:
         """The equations of what is seen."""
-        parts = in_parts(pixels, weights, mask, self.batch)
-        return equations_of(self.rig, parts, frame=self.frame, dtype=self.dtype, alike=self.alike)
+        seen = observe(pixels, weights, mask, self.batch)
+        return equations_of(self.rig, seen, frame=self.frame, dtype=self.dtype, alike=self.alike)
 
     def _described(
         self, equations: Equations, points: Vector3, status: Tensor, covariance: bool
     ) -> tuple[Tensor, ...]:
         """The fields of a :class:`Triangulation`, status last."""
-        cameras, valid = equations.rig.cameras, ok(status)
-
-        def seen(part: Observations, valid: Tensor, *points: Tensor) -> tuple[Tensor, ...]:
-            (px, py, weights), (x, y, z), valid = part, points, valid.unsqueeze(-2)
-            used = ~weights.unused & valid
-            found = reproject(cameras.proj, (x, y, z), used)
-            squared, depth = squared_errors(found, px, py), found.depth
-            if not surely_all(found.seen):
-                # At a used camera's centre, in front of it by rounding, it may be behind by that.
-                depth = torch.where(used, depth.clamp(min=0), torch.where(valid, depth, 0.0))
-            outward = [
-                self._fitting(one)
-                for one in (
-                    depth,
-                    mean_of(squared, found.seen, weights.squared),
-                    parallax_of(cameras.centers, (x, y, z), used.to(found.x.dtype)),
-                    safe_sqrt(squared),
-                )
-            ]
-            if covariance:
-                outward += covariance_of(cameras.proj, found, weights.squared)
-                outward.append(weights.largest.squeeze(-2).expand_as(x))
-            return tuple(outward)
-
-        depth, residual, parallax, errors, *noise = equations.each(seen, valid, *points)
-        described: tuple[Tensor, ...] = (self._outward(points), depth, residual, parallax, errors)
+        cameras, valid = equations.rig.cameras, ok(status).unsqueeze(-2)
+        px, py, weights = equations.observed
+        used = ~weights.unused & valid
+        found = reproject(cameras.proj, points, used)
+        squared, depth = squared_errors(found, px, py), found.depth
+        if not surely_all(found.seen):
+            # At a used camera's centre, in front of it by rounding, it may be behind by that.
+            depth = torch.where(used, depth.clamp(min=0), torch.where(valid, depth, 0.0))
+        fields = (
+            depth,
+            mean_of(squared, found.seen, weights.squared),
+            parallax_of(cameras.centers, points, used.to(depth.dtype)),
+            safe_sqrt(squared),
+        )
+        described = (self._outward(points), *(self._clamped(x).to(self.dtype) for x in fields))
         if covariance:
-            *entries, largest = noise
-            described = (*described, representable(unscaled(entries, largest), self.dtype))
+            noise = unscaled(
+                covariance_of(cameras.proj, found, weights.squared), weights.largest.squeeze(-2)
+            )
+            described = (*described, representable(noise, self.dtype))
         return (*described, status)
 
     def adjoint(
@@ -116,7 +107,7 @@ class LongWay:
         """Gradients by cameras, pixels and weights of points with this gradient."""
         equations = self.see(pixels, weights, mask)
         solved, status = solve_linear(equations)
-        found = gradients_of(
+        return gradients_of(
             equations,
             solved.vector,
             ok(status),
@@ -125,14 +116,10 @@ class LongWay:
             of_cameras=needed[0],
             dtype=pixels.dtype,
         )
-        return found.proj, found.pixels, found.weights
 
     def _outward(self, points: Vector3) -> Tensor:
         """Three ``(*B, N)`` as ``(*B, N, 3)`` of the caller's type."""
         return as_one([self._clamped(component) for component in points], self.dtype)
-
-    def _fitting(self, values: Tensor) -> Tensor:
-        return self._clamped(values).to(self.dtype)
 
     def _clamped(self, values: Tensor) -> Tensor:
         limit = torch.finfo(self.dtype).max

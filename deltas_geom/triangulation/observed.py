@@ -13,7 +13,6 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
-from deltas_geom.numerics.chunks import serial_points
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
@@ -25,18 +24,24 @@ class Cameras(NamedTuple):
     Attributes:
         proj: ``(*B, V, 3, 4)``, 0 for cameras that are not finite.
         broken: ``(*B, V)`` 1 for those, else 0.
-        centers: ``(*B, V, 3)``, see :func:`projection_centers`.
+        inverse: ``(*B, V, 3, 3)`` of the first columns; 0 where there is none.
+        centers: ``(*B, V, 3)``; 0 with zero gradient where there is no inverse.
     """
 
     proj: Tensor
     broken: Tensor
+    inverse: Tensor
     centers: Tensor
 
 
 def cameras_of(proj: Tensor) -> Cameras:
-    """Cameras ``(*B, V, 3, 4)`` with their centres."""
+    """Cameras ``(*B, V, 3, 4)`` with their centres.
+
+    Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
+    """
     clean, broken = finite_cameras(proj)
-    return Cameras(clean, broken, projection_centers(clean))
+    inverse, _ = inverted(clean[..., :3])
+    return Cameras(clean, broken, inverse, -(inverse * clean[..., 3:].mT).sum(dim=-1))
 
 
 def finite_cameras(proj: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,35 +81,6 @@ def observe(
     """
     x, y, sound = clean_pixels(pixels)
     return Observations(x, y, weigh(weights, mask, batch=batch, like=pixels, sound=sound))
-
-
-def in_parts(
-    pixels: Tensor, weights: Tensor | None, mask: Tensor | None, batch: torch.Size
-) -> list[Observations]:
-    """:func:`observe`, so few points at a time that no operation on their views starts threads."""
-    # Who derives the operations, or compiles them, wants them once.
-    if torch.compiler.is_compiling() or torch.is_grad_enabled():
-        return [observe(pixels, weights, mask, batch)]
-    count, few = pixels.shape[-2], serial_points(pixels)
-    if count <= few:
-        return [observe(pixels, weights, mask, batch)]
-    parts: list[Observations] = []
-    for start in range(0, count, few):
-        end = start + few
-        if parts and weights is None and mask is None:
-            x, y, sound = clean_pixels(pixels[..., start:end, :])
-            if sound is None and parts[0].weights.sound.shape[-1] == 1:
-                parts.append(Observations(x, y, parts[0].weights))
-                continue
-        parts.append(
-            observe(
-                pixels[..., start:end, :],
-                None if weights is None else weights[..., start:end],
-                None if mask is None else mask[..., start:end],
-                batch,
-            )
-        )
-    return parts
 
 
 def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -153,17 +129,6 @@ def check_observed(
     )
     check_bool(mask=mask)
     return batch
-
-
-def projection_centers(proj: Tensor) -> Tensor:
-    """Centres ``(*B, V, 3)`` of cameras ``(*B, V, 3, 4)``.
-
-    A camera without a finite centre gets 0 with zero gradient.
-
-    Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
-    """
-    inverse, _ = inverted(proj[..., :3])
-    return -(inverse * proj[..., 3:].mT).sum(dim=-1)
 
 
 def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:

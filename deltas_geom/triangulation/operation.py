@@ -13,11 +13,12 @@ from torch import Tensor
 
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Inputs, recomputed
+from deltas_geom.records import Record
 from deltas_geom.triangulation.judge import ok
-from deltas_geom.triangulation.results import Points
+from deltas_geom.triangulation.results import within_residual
 from deltas_geom.triangulation.uncertainty import representable
 
-_Points = TypeVar("_Points", bound=Points)
+_Points = TypeVar("_Points", bound=Record)
 _Seen = TypeVar("_Seen")
 _Found = TypeVar("_Found")
 _POINTS = {"points": -2, "pixels": -2, "covariance": -3}  # the dim of points; -1 in other fields
@@ -76,7 +77,7 @@ def operation(
     *fields, status = recomputed(compute, *inputs, values=values, cut=cut)
     known: dict[str, Any] = dict.fromkeys(record._fields) | dict(zip(names, fields, strict=True))
     found = record(**known | {"status": status, "valid": ok(status)})
-    return found if max_residual is None else found.within_residual(max_residual)
+    return found if max_residual is None else within_residual(found, max_residual)
 
 
 def _outward(name: str, field: Tensor, dtype: torch.dtype) -> Tensor:

@@ -1,6 +1,6 @@
 """Triangulated points, and what is known about each."""
 
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,15 +12,56 @@ from deltas_geom.status import Status
 _R = TypeVar("_R", bound=Record)
 
 
-class Points(Protocol):
-    """What is common to the records of triangulated points."""
+def within_residual(found: _R, max_residual: float) -> _R:
+    """The same without the points about which the views disagree: RESIDUAL_TOO_LARGE.
 
-    _fields: tuple[str, ...]
+    They become 0 in every field, as all that failed, but for ``errors``, which tell which
+    view is wrong.
 
-    def __init__(self, **fields: Any) -> None: ...
+    Args:
+        found: points with a residual.
+        max_residual: px, or rad after :func:`deltas_geom.triangulate_rays` and its kin.
 
-    def within_residual(self, max_residual: float) -> Self:
-        """The same without the points about which the views disagree by more."""
+    Raises:
+        ValueError: it is not positive.
+    """
+    check_positive(max_residual=max_residual)
+    known: Any = found
+    kept = without(found, known.residual > max_residual, Status.RESIDUAL_TOO_LARGE)
+    return kept._replace(errors=known.errors)
+
+
+def beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
+    """Which depths are nearer or farther than a range (near, far), metres."""
+    check_depth_range(depth_range)
+    near, far = depth_range
+    return (depth < near) | (depth > far)
+
+
+def without(found: _R, outside: Tensor, reason: Status) -> _R:
+    """Any record of points with those of ``(*B, N)`` that were valid failed for a reason.
+
+    Args:
+        found: its fields are 0 there from now on, but for ``pixels``, which lose their gradient.
+        outside: bool, the points to refuse.
+        reason: why.
+    """
+    known = found._asdict()
+    outside, point = known["valid"] & outside, known.get("point_index")
+    seen = outside.unsqueeze(-2) if point is None else outside[point]
+    which = dict.fromkeys(("depth", "errors", "inliers", "used"), seen)
+    which |= {"points": outside[..., None], "covariance": outside[..., None, None]}
+    which["pixels"] = seen[..., None]
+    changed: dict[str, Any] = {"status": torch.where(outside, reason.value, known["status"])}
+    for name, field in known.items():
+        if field is None or name in ("status", "point_index"):
+            continue
+        mask = which.get(name, outside)
+        if field.dtype == torch.bool:
+            changed[name] = field & ~mask
+        else:
+            changed[name] = torch.where(mask, field.detach() if name == "pixels" else 0.0, field)
+    return found._replace(**changed)
 
 
 class Triangulation(Record):
@@ -50,19 +91,7 @@ class Triangulation(Record):
     covariance: Tensor | None
     errors: Tensor
 
-    def within_residual(self, max_residual: float) -> "Triangulation":
-        """The same without the points about which the views disagree: RESIDUAL_TOO_LARGE.
-
-        They become 0 in every field, as all that failed, but for ``errors``, which tell which
-        view is wrong.
-
-        Args:
-            max_residual: px, or rad after :func:`deltas_geom.triangulate_rays` and its kin.
-
-        Raises:
-            ValueError: it is not positive.
-        """
-        return refused_by_residual(self, max_residual)
+    within_residual = within_residual
 
     def within_depth(
         self, depth_range: tuple[float, float], *, view: int = 0, used: Tensor | None = None
@@ -129,9 +158,7 @@ class RobustTriangulation(Record):
     errors: Tensor
     inliers: Tensor
 
-    def within_residual(self, max_residual: float) -> "RobustTriangulation":
-        """As :meth:`Triangulation.within_residual`, of the inliers."""
-        return refused_by_residual(self, max_residual)
+    within_residual = within_residual
 
     def within_depth(self, depth_range: tuple[float, float]) -> "RobustTriangulation":
         """As :meth:`Triangulation.within_depth`, the range being that of every inlier."""
@@ -144,45 +171,3 @@ def of_inliers(found: Triangulation, inliers: Tensor, reason: Tensor) -> RobustT
     status = torch.where(inliers.any(dim=-2), found.status, reason)
     inliers = inliers & found.valid.unsqueeze(-2)
     return RobustTriangulation(**found._replace(status=status)._asdict(), inliers=inliers)
-
-
-def beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
-    """Which depths are nearer or farther than a range (near, far), metres."""
-    check_depth_range(depth_range)
-    near, far = depth_range
-    return (depth < near) | (depth > far)
-
-
-def refused_by_residual(found: _R, max_residual: float, point: Tensor | None = None) -> _R:
-    """Any record of points :func:`without` those of a larger residual, but for its ``errors``."""
-    check_positive(max_residual=max_residual)
-    known: Any = found
-    kept = without(found, known.residual > max_residual, Status.RESIDUAL_TOO_LARGE, point)
-    return kept._replace(errors=known.errors)
-
-
-def without(found: _R, outside: Tensor, reason: Status, point: Tensor | None = None) -> _R:
-    """Any record of points with those of ``(*B, N)`` that were valid failed for a reason.
-
-    Args:
-        found: its fields are 0 there from now on, but for ``pixels``, which lose their gradient.
-        outside: bool, the points to refuse.
-        reason: why.
-        point: ``(T)`` index of each observation's point, if views are listed.
-    """
-    known = found._asdict()
-    outside = known["valid"] & outside
-    seen = outside.unsqueeze(-2) if point is None else outside[point]
-    which = dict.fromkeys(("depth", "errors", "inliers", "used"), seen)
-    which |= {"points": outside[..., None], "covariance": outside[..., None, None]}
-    which["pixels"] = seen[..., None]
-    changed: dict[str, Any] = {"status": torch.where(outside, reason.value, known["status"])}
-    for name, field in known.items():
-        if field is None or name in ("status", "point_index"):
-            continue
-        mask = which.get(name, outside)
-        if field.dtype == torch.bool:
-            changed[name] = field & ~mask
-        else:
-            changed[name] = torch.where(mask, field.detach() if name == "pixels" else 0.0, field)
-    return found._replace(**changed)

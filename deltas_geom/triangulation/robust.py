@@ -143,7 +143,7 @@ def _observe(
     mask: Tensor | None,
     batch: torch.Size,
 ) -> _Observations:
-    cameras, inverse = known.inverses()
+    cameras = known.cameras()
     x, y, sound = clean_pixels(pixels)
     healthy = unless_all(cameras.broken == 0)
     sound = both(sound, None if healthy is None else healthy.unsqueeze(-1))
@@ -156,7 +156,8 @@ def _observe(
     usable, shape = ~weighed.unused, (*batch, *pixels.shape[-3:-1])
     counted = unless_all(usable)
     x, y = only(x, counted), only(y, counted)
-    rays = product(inverse[..., :2], torch.stack([x, y], dim=-2)) + inverse[..., 2:]
+    rays = product(cameras.inverse[..., :2], torch.stack([x, y], dim=-2))
+    rays = rays + cameras.inverse[..., 2:]
     return _Observations(
         proj=cameras.proj.expand(*batch, *cameras.proj.shape[-3:]),
         pixels=torch.stack([x, y], dim=-1).expand(*shape, 2),

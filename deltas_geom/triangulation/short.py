@@ -8,9 +8,11 @@ those of `rig_frame`, the reasons of failures those of `judge`. N comes before V
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from deltas_geom.triangulation.judge import REASONS
+from deltas_geom.triangulation.observed import Cameras
 from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
 
 Array = NDArray[Any]
@@ -41,6 +43,12 @@ class ShortRig(NamedTuple):
     datum: Array
     offset: Array
     near: Array
+
+    def cameras(self) -> Cameras:
+        """For the long way."""
+        known = map(torch.from_numpy, (self.proj, self.inverse, self.centers))
+        proj, inverse, centers = known
+        return Cameras(proj, torch.from_numpy(~self.finite).double(), inverse, centers)
 
 
 class Solved(NamedTuple):

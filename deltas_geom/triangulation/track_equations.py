@@ -75,7 +75,7 @@ def pose_tracks(
         weights: ``(T)``.
         num_points: N.
     """
-    cameras, broken, centers = cameras_of(proj)
+    cameras, broken, _, centers = cameras_of(proj)
     camera = at(cameras.permute(1, 2, 0), camera_index)
     x, y, sound = clean_pixels(pixels)
     sound = torch.ones_like(x, dtype=torch.bool) if sound is None else sound

@@ -15,7 +15,7 @@ from deltas_geom.records import Record
 from deltas_geom.status import Status
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import angle_of, projected, squared_errors
-from deltas_geom.triangulation.results import beyond, refused_by_residual, without
+from deltas_geom.triangulation.results import beyond, within_residual, without
 from deltas_geom.triangulation.solution import (
     Solution,
     follow_linear,
@@ -67,15 +67,13 @@ class TriangulatedTracks(Record):
     point_index: Tensor
     used: Tensor
 
-    def within_residual(self, max_residual: float) -> "TriangulatedTracks":
-        """As :meth:`Triangulation.within_residual`; px."""
-        return refused_by_residual(self, max_residual, self.point_index)
+    within_residual = within_residual
 
     def within_depth(self, depth_range: tuple[float, float]) -> "TriangulatedTracks":
         """As :meth:`Triangulation.within_depth`, the range being that of all used observations."""
         outside = (beyond(self.depth, depth_range) & self.used).to(self.depth.dtype)
         outside = summed(outside, self.point_index, len(self.valid)) > 0
-        return without(self, outside, Status.OUT_OF_RANGE, self.point_index)
+        return without(self, outside, Status.OUT_OF_RANGE)
 
 
 @without_autocast

@@ -8,10 +8,10 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, transformed
-from deltas_geom.triangulation.equations import Frame, Rig, rig_like, rig_of
+from deltas_geom.triangulation.equations import Frame, Rig, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
-from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed, inverted
+from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.short import FEW, ShortRig, short_rig
 from deltas_geom.triangulation.short_way import ShortWay
@@ -99,18 +99,9 @@ class KnownCameras:
         self._short: ShortRig | None = None
         self._long: Rig | None = None
 
-    def inverses(self) -> tuple[Cameras, Tensor]:
-        """The cameras in the solver's type, and inverses ``(*B, V, 3, 3)`` of their first columns.
-
-        Without gradient; 0 where there is no inverse.
-        """
-        proj = self.proj.detach()
-        if self._plain():
-            rig = self.short()
-            clean, finite, centers = map(torch.from_numpy, (rig.proj, rig.finite, rig.centers))
-            return Cameras(clean, (~finite).double(), centers), torch.from_numpy(rig.inverse)
-        cameras = cameras_of(proj)
-        return cameras, inverted(cameras.proj[..., :3])[0]
+    def cameras(self) -> Cameras:
+        """In the solver's type, without gradient."""
+        return self.short().cameras() if self._plain() else cameras_of(self.proj.detach())
 
     def _plain(self) -> bool:
         return values_at_hand(self.proj) and self.proj.dtype in _PLAIN
@@ -124,7 +115,7 @@ class KnownCameras:
     def long(self) -> Rig:
         """For any number of points; without gradient."""
         if self._long is None:
-            self._long = rig_like(self.short()) if self._plain() else rig_of(self.proj.detach())
+            self._long = rig_of(self.cameras())
         return self._long
 
 
@@ -178,7 +169,7 @@ class Call:
         """Points ``(*B, N, 3)``."""
 
         def derivable(proj: Tensor, *seen: Any) -> tuple[Tensor]:
-            return self.long(rig_of(proj)).points(*seen, derivable=True)
+            return self.long(rig_of(cameras_of(proj))).points(*seen, derivable=True)
 
         def adjoint(
             gradients: tuple[Tensor], needed: tuple[bool, ...], *tensors: Any
@@ -193,7 +184,9 @@ class Call:
         """Points with all that is known about them."""
 
         def derivable(proj: Tensor, *seen: Any) -> tuple[Tensor, ...]:
-            return self.long(rig_of(proj)).full(*seen, covariance=covariance, derivable=True)
+            return self.long(rig_of(cameras_of(proj))).full(
+                *seen, covariance=covariance, derivable=True
+            )
 
         def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
             return self.way.full(*seen, covariance=covariance)
@@ -207,7 +200,7 @@ class Call:
     def _computed(
         self, function: Function, values: Function, outputs: tuple[int, ...]
     ) -> tuple[Tensor, ...]:
-        cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs, parts=True)
+        cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs)
         return recomputed(function, *self.tensors, values=values, cut=cut)
 
 

@@ -19,10 +19,10 @@ from deltas_geom.records import Record
 from deltas_geom.status import Status
 from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
-from deltas_geom.triangulation.observed import clean_pixels, inverted
+from deltas_geom.triangulation.observed import clean_pixels, finite_cameras, inverted
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import reproject
-from deltas_geom.triangulation.results import beyond, refused_by_residual, without
+from deltas_geom.triangulation.results import beyond, within_residual, without
 from deltas_geom.triangulation.uncertainty import covariance_of, unpacked3
 
 
@@ -54,9 +54,7 @@ class TwoViewTriangulation(Record):
     errors: Tensor
     covariance: Tensor | None
 
-    def within_residual(self, max_residual: float) -> "TwoViewTriangulation":
-        """As :meth:`Triangulation.within_residual`; px."""
-        return refused_by_residual(self, max_residual)
+    within_residual = within_residual
 
     def within_depth(
         self, depth_range: tuple[float, float], *, view: int | None = None
@@ -169,11 +167,9 @@ class _Seen(NamedTuple):
 
 def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
     x, y, sound = clean_pixels(pixels)
-    camera, used = proj.to(x.dtype), torch.ones_like(x, dtype=torch.bool) if mask is None else mask
-    # Products of four of what is let through can be represented. NaN is not let through.
-    known = (camera.abs() < torch.finfo(x.dtype).max ** 0.25).all(-1).all(-1)
-    finite = only(known.unsqueeze(-1), sound, other=False)
-    camera = torch.where(known[..., None, None], camera, 0.0)
+    used = torch.ones_like(x, dtype=torch.bool) if mask is None else mask
+    camera, broken = finite_cameras(proj)
+    finite = only((broken == 0).unsqueeze(-1), sound, other=False)
     xy = torch.where((finite & used).unsqueeze(-2), torch.stack([x, y], dim=-2), 0.0)
     known, enough = (finite | ~used).all(dim=-2), used.all(dim=-2)
     dtype = torch.promote_types(proj.dtype, pixels.dtype)

@@ -16,7 +16,6 @@ from deltas_geom.triangulation.observed import (
     clean_pixels,
     clean_points,
     finite_cameras,
-    projection_centers,
 )
 from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
 from deltas_geom.triangulation.weights import weigh
@@ -276,7 +275,7 @@ def _of_poses(
     ox, oy, oz = (
         component.unsqueeze(-2) - center.unsqueeze(-1)
         for component, center in zip(
-            points, projection_centers(cameras).unbind(dim=-1), strict=True
+            points, cameras_of(cameras).centers.unbind(dim=-1), strict=True
         )
     )  # (*B, V, N)
     zero, one = torch.zeros_like(ox), torch.ones_like(ox)

@@ -37,9 +37,9 @@ def run_demo(
     Raises:
         UserError: the folder cannot be written, or scikit-image carries no pair.
     """
-    pair, encode = motorcycle(), EncodedFrames(model)
+    pair = motorcycle()
     if config.work_size is None:
-        config = surer(config, [_gain(encode, pair, config)])
+        config = surer(config, [_gain(EncodedFrames(model), pair, config)])
     folder = prepare_output(
         out,
         settings={
@@ -54,7 +54,7 @@ def run_demo(
     )
     started = time.perf_counter()
     with timed_stages(model) as laps:
-        result = predict_frame(encode, [pair.left, pair.right], config)
+        result = predict_frame(EncodedFrames(model), [pair.left, pair.right], config)
     elapsed = time.perf_counter() - started
     seconds = _seconds_by_stage(laps)
     dense = depth_metrics(result.map.depth, pair.depth, depth_range=config.depth_range)
