@@ -228,8 +228,9 @@ def _usable(capture: Capture) -> Capture:
             what = f"no frame has a pose and an image; missing are those of {names}"
             raise UserError(what, error.where, error.remedy)
         what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(capture.lost)})"
-        where = [Path(lost.error.where).parent for lost in capture.lost.values()]
-        raise UserError(what, next(iter(where), capture.path), "run the tracking again")
+        files = {Path(lost.error.where) for lost in capture.lost.values()}
+        first = next(iter(files))
+        raise UserError(what, first if len(files) == 1 else first.parent, "run the tracking again")
     _check_images(capture)
     return capture
 
