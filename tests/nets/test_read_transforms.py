@@ -234,6 +234,9 @@ def test_a_lost_pose_and_a_missing_image_are_lost_frames(tmp_path: Path) -> None
         assert len(capture.lost) == 2
     with pytest.raises(UserError, match=r"frame 1 \(images/b.png\) has no transform_matrix"):
         capture.frame("b")
+    with pytest.raises(UserError, match="has no transform_matrix") as error:
+        open_capture(write(tmp_path, {"transform_matrix": None}))
+    assert error.value.where == tmp_path / "transforms.json"
     assert {id: lost.reason for id, lost in capture.lost.items()} == {
         "b": "no pose",
         "c": "no image",

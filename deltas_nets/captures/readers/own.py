@@ -110,10 +110,13 @@ def _entries(root: Fields, file: Path, finder: FileFinder) -> list[_Entry]:
     for frame in fields:
         check_keys(frame, FRAME)
     cameras = named_cameras(root)
-    return [
-        _Entry(id, frame, finder.find(frame.text("image")), stated_camera(root, frame, cameras))
-        for id, frame in zip(_ids(fields, file), fields, strict=True)
-    ]
+    entries = []
+    for id, frame in zip(_ids(fields, file), fields, strict=True):
+        image = frame.text("image")
+        frame.where = f"{frame.where} ({image[:80]})"
+        camera = stated_camera(root, frame, cameras)
+        entries.append(_Entry(id, frame, finder.find(image), camera))
+    return entries
 
 
 def _frame(entry: _Entry, camera: SizedCamera, root: Fields, depths: FileFinder) -> Frame | Lost:
@@ -123,8 +126,9 @@ def _frame(entry: _Entry, camera: SizedCamera, root: Fields, depths: FileFinder)
     if isinstance(pose, Lost):
         return pose
     if entry.image is None:
-        what = f"{fields.where}: the image {fields.text('image')[:80]} is missing"
-        return Lost("no image", UserError(what, fields.path, where_to_put(fields.text("image"))))
+        name = fields.text("image")
+        what = f"the image {name[:80]} is missing"
+        return Lost("no image", UserError(what, fields.path, where_to_put(name)))
     frame = Frame(
         id=entry.id,
         image_path=entry.image,

@@ -23,7 +23,8 @@ def is_metric(root: Fields) -> bool:
         UserError: no unit is stated, or one whose length is known and is not a metre.
     """
     if "units" not in root:
-        remedy = f"say {_as_said(root, 'metres')}, or unknown where the scale is not known"
+        unknown = _as_said(root, "unknown")
+        remedy = f"say {_as_said(root, 'metres')}, or {unknown} where the scale is not known"
         raise UserError("the file does not state its units", root.path, remedy)
     units = root.text("units").strip()
     length = OTHERS.get(units.lower().removesuffix("s"))
