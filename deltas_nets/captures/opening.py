@@ -227,11 +227,19 @@ def _usable(capture: Capture) -> Capture:
             names = ids_in_words(without_image)
             what = f"no frame has a pose and an image; missing are those of {names}"
             raise UserError(what, error.where, error.remedy)
-        what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(capture.lost)})"
-        where = [Path(lost.error.where).parent for lost in capture.lost.values()]
-        raise UserError(what, next(iter(where), capture.path), "run the tracking again")
+        raise _without_poses(capture)
     _check_images(capture)
     return capture
+
+
+def _without_poses(capture: Capture) -> UserError:
+    """Why no frame has a pose: where one file has all, a key of it may be misspelt."""
+    errors = [lost.error for lost in capture.lost.values()]
+    first = errors[0]
+    if len({error.where for error in errors}) == 1:
+        return UserError(f"every pose is lost: {first.what}", first.where, first.remedy)
+    what = f"every pose is lost (NaN, infinite or missing; frames {ids_in_words(capture.lost)})"
+    return UserError(what, Path(first.where).parent, "run the tracking again")
 
 
 def _check_images(capture: Capture) -> None:

@@ -8,12 +8,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.new_folder import check_new
 from deltas_nets.captures.writers import colmap, own, scannet, transforms
 from deltas_nets.captures.writers.files import Placing, Putting
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import counted
 
-__all__ = ["WRITERS", "Writer", "save_capture"]
+__all__ = ["WRITERS", "Writer", "doubts_of_images", "save_capture"]
 
 Writer = Callable[[Capture, Path, Putting], list[str]]
 
@@ -25,6 +27,21 @@ WRITERS: Mapping[str, Writer] = {
     "transforms": transforms.write,
 }
 """By the name of the format; see `deltas_nets.captures.writers` for what they do."""
+
+
+def doubts_of_images(capture: Capture) -> list[str]:
+    """A warning of the images that are copied as they are though nobody can use them."""
+    broken: dict[str, UserError] = {}
+    for id, frame in capture.frames.items():
+        try:
+            frame.check_image()
+        except UserError as error:
+            broken[id] = error
+    if not broken:
+        return []
+    first = next(iter(broken.values()))
+    count = counted(len(broken), "image")
+    return [f"{count} cannot be used ({ids_in_words(broken)}): {first}"]
 
 
 def save_capture(

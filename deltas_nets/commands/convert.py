@@ -69,7 +69,7 @@ class Convert(Command):
         from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.ids import ids_in_words
         from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.saving import save_capture
+        from deltas_nets.captures.saving import doubts_of_images, save_capture
         from deltas_nets.terminal import counted, progress, warn
 
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
@@ -85,7 +85,7 @@ class Convert(Command):
             print(f"{len(found.xyz)} points that two maps or more agree on")
         with progress("writing", len(capture.frames)) as report:
             left_out = save_capture(capture, self.out, self.to, placing=self.images, report=report)
-        for doubt in (*capture.doubts, *left_out):
+        for doubt in (*capture.doubts, *left_out, *doubts_of_images(capture)):
             warn(doubt)
         if capture.lost:
             warn(f"frames that cannot be used are left out: {ids_in_words(capture.lost)}")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from posed_captures import IN_TRANSFORMS, captures, image_of
 from run_command import Run, assert_one_line
 from small_capture import write_capture
@@ -200,3 +201,24 @@ def test_the_command_says_what_it_leaves_out_and_never_overwrites(run: Run, tmp_
     assert "4 frames" in said.out and "depth" in said.err and "metre" in said.err
     assert_one_line(run("convert", folder, tmp_path / "out"), "not empty")
     assert len(os.listdir(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (b"", "the file is empty"),
+        (b"<html>", "cannot be decoded"),
+        (-400, "truncated"),
+        (None, "image is 32x24"),
+    ],
+)
+def test_images_that_nobody_can_use_are_said(
+    run: Run, tmp_path: Path, content: bytes | int | None, what: str
+) -> None:
+    image = write_capture(tmp_path / "in") / "color" / "1.jpg"
+    if content is None:
+        Image.new("RGB", (32, 24)).save(image)
+    else:
+        image.write_bytes(image.read_bytes()[:content] if isinstance(content, int) else content)
+    said = run("convert", tmp_path / "in", tmp_path / "out")
+    assert "1 image cannot be used (1)" in said.err and what in said.err and "4 frames" in said.out

@@ -262,6 +262,63 @@ def test_a_csv_of_a_spreadsheet_with_decimal_commas_says_the_same(tmp_path: Path
     assert open_capture(second).frame("7").cam_from_world[0, 3] == -0.5
 
 
+@pytest.mark.parametrize("form", ["sep=;", "tabs", "filled"])
+def test_a_csv_of_a_spreadsheet_says_the_same(tmp_path: Path, form: str) -> None:
+    write(tmp_path)
+    (tmp_path / "frames.json").unlink()
+    pose = " ".join(f"{number:g}" for number in AHEAD.ravel())
+    text = "# units: metres\nimage,fx,fy,cx,cy,world_from_cam\n"
+    text += f"images/a.png,9,9.5,3.5,2.5,{pose}\n"
+    (tmp_path / "frames.csv").write_text(text)
+    expected = open_capture(tmp_path).fingerprint()
+    other = {
+        "sep=;": "sep=;\n" + text.replace(",", ";").replace(".5", ",5"),
+        "tabs": text.replace(",", "\t"),
+        "filled": text.replace("metres", "metres,,,,,") + ",,,,,\n , ,,,,\n",
+    }[form]
+    (tmp_path / "frames.csv").write_text(other)
+    capture = open_capture(tmp_path)
+    assert capture.fingerprint() == expected and capture.metric
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "remedy"),
+    [
+        ("", "the file is empty", ""),
+        ("\ufeff \n\n", "the file is empty", ""),
+        ("image\nimages/a.png\n", "does not state its units", "say # units: metres"),
+        ("# units: mm\nimage\nimages/a.png\n", "are mm", "say # units: metres"),
+    ],
+)
+def test_what_a_csv_lacks_is_said_as_a_csv_has_it(
+    tmp_path: Path, text: str, what: str, remedy: str
+) -> None:
+    write(tmp_path)
+    (tmp_path / "frames.json").unlink()
+    (tmp_path / "frames.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError) as error:
+        open_capture(tmp_path)
+    assert what in error.value.what and remedy in error.value.remedy
+
+
+def test_what_is_wrong_is_said_where_it_stands(tmp_path: Path) -> None:
+    named = {"cameras": {"left": {"fx": "9"}}, "frames": changed(camera="left")}
+    wrong = {"it has a fx": {"fx": "9"}, "left of cameras of it has a fx": named}
+    wrong[r"frame 0 \(images/a.png\) has a fx"] = {"frames": changed(fx="9")}
+    for what, root in wrong.items():
+        with pytest.raises(UserError, match=what):
+            open_capture(write(tmp_path, **root))
+
+
+def test_depth_that_is_missing_is_said_and_outside_is_not_looked_for(tmp_path: Path) -> None:
+    capture = open_capture(write(tmp_path, changed(depth="../../depth/a.png")))
+    (doubt,) = capture.doubts
+    assert "depth ../../depth/a.png is missing" in doubt and "copy or link" in doubt
+    with pytest.raises(UserError) as error:
+        open_capture(write(tmp_path, changed(image="/data/gone.png")))
+    assert "copy or link" in error.value.remedy
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -4,7 +4,8 @@ import shutil
 import struct
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from unicodedata import normalize
 
 import numpy as np
 import pytest
@@ -182,6 +183,30 @@ def test_models_and_images_are_found_wherever_they_are(
     seen = capture.points.seen
     assert (seen.point.tolist(), seen.frame.tolist()) == ([0], [1])
     assert seen.pixels.tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images"])
+def test_a_model_of_both_kinds_is_refused_by_the_file_it_lacks(tmp_path: Path, stem: str) -> None:
+    model = write_model(tmp_path) / "sparse" / "0"
+    (model / f"{stem}.txt").rename(model / f"{stem}.bin")
+    (model / "points3D.txt").unlink()
+    with pytest.raises(UserError) as error:
+        open_capture(tmp_path)
+    assert f"it has {stem}.bin, no {stem}.txt" in error.value.what and error.value.where == model
+
+
+@pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
+def test_accents_may_be_written_in_one_letter_or_two(
+    tmp_path: Path, forms: tuple[Literal["NFC", "NFD"], Literal["NFC", "NFD"]]
+) -> None:
+    in_model, on_disk = (normalize(form, "K\u00fcche/\u00c0.png") for form in forms)
+    write_model(tmp_path, images=f"1 1 0 0 0 0 0 0 1 {in_model}\n\n")
+    file = tmp_path / "images" / on_disk
+    file.parent.mkdir()
+    shutil.copy(image_of((6, 8)), file)
+    capture = open_capture(tmp_path)
+    assert not capture.lost and not capture.doubts
+    assert [frame.image_path for frame in capture.frames.values()] == [file]
 
 
 @pytest.mark.parametrize("part", ["sparse/0", "sparse", "sparse/0/images.txt"])

@@ -37,7 +37,8 @@ def dslr(tmp_path: Path) -> Path:
     said = {"fl_x": F, "fl_y": F, "cx": CX + 0.5, "cy": CY + 0.5, "w": 64, "h": 48}
     said |= {f"k{i + 1}": k for i, k in enumerate(LENS)}
     (folder / "nerfstudio").mkdir()
-    content = {**said, "camera_model": "OPENCV_FISHEYE", "frames": frames, "test_frames": []}
+    content = {**said, "camera_model": "OPENCV_FISHEYE"}
+    content |= {"frames": frames[:-1], "test_frames": frames[-1:]}
     (folder / "nerfstudio/transforms.json").write_text(json.dumps(content))
     return folder
 

@@ -122,6 +122,42 @@ def test_images_beside_the_folder_are_found_where_the_file_says_so(tmp_path: Pat
     assert list(open_capture(tmp_path / "it").frames) == ["a"]
 
 
+def test_an_image_of_another_suffix_is_taken_with_a_warning(tmp_path: Path) -> None:
+    names = ["images/a.jpg", "images/b.JPEG", "elsewhere/a.jpg"]
+    capture = open_capture(write(tmp_path, *({"file_path": name} for name in names)))
+    assert list(capture.frames) == ["images/a", "images/b"]
+    assert list(capture.lost) == ["elsewhere/a"]
+    (doubt,) = capture.doubts
+    assert doubt.startswith(f"{tmp_path}/images/a.png is taken for images/a.jpg")
+    shutil.copy(tmp_path / "images" / "a.png", tmp_path / "images" / "a.webp")
+    assert "images/a" in open_capture(tmp_path).lost  # no telling which
+
+
+def test_of_reduced_copies_alone_the_largest_is_taken_with_a_warning(tmp_path: Path) -> None:
+    write(tmp_path)
+    for factor in (2, 4):
+        (tmp_path / f"images_{factor}").mkdir()
+        for name in ("a.png", "b.png"):
+            with Image.open(tmp_path / "images" / name) as image:
+                reduced = image.resize((8 // factor, 6 // factor))
+            reduced.save(tmp_path / f"images_{factor}" / name)
+    shutil.rmtree(tmp_path / "images")
+    capture = open_capture(tmp_path)
+    assert the_frame(capture).image_path == tmp_path / "images_2" / "a.png"
+    assert the_frame(capture).K[0, 0] == CAMERA["fl_x"] / 2
+    assert [("is taken for" in d, "are scaled" in d) for d in capture.doubts] == [
+        (True, False),
+        (False, True),
+    ]
+
+
+@pytest.mark.parametrize("name", ["/data/c.png", "C:/data/c.png", "../../images/c.png"])
+def test_who_names_images_outside_is_told_to_copy_or_link_them(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UserError) as error:
+        open_capture(write(tmp_path, {"file_path": name}))
+    assert "copy or link" in error.value.remedy and "not followed" in error.value.remedy
+
+
 def test_names_that_fit_two_images_fit_none(tmp_path: Path) -> None:
     for name in ("left", "right"):
         (tmp_path / name).mkdir()
@@ -151,6 +187,11 @@ def test_depth_its_unit_and_what_it_says_of_the_world(tmp_path: Path) -> None:
     capture = open_capture(write(tmp_path, depth, depth_unit_scale_factor=0.01))
     assert the_frame(capture).read_depth()[0, 0] == pytest.approx(2.5)
     assert not open_capture(write(tmp_path)).metric
+    gone = [_frame("a") | depth, _frame("b") | {"depth_file_path": "gone/b.png"}]
+    capture = open_capture(write(tmp_path, *gone))
+    assert "the depth gone/b.png is missing" in " ".join(capture.doubts)
+    capture = open_capture(write(tmp_path, gone[1]))
+    assert capture.metric and len(capture.doubts) == 1
     assert open_capture(write(tmp_path, units="metres")).metric
 
 
@@ -171,6 +212,8 @@ def test_points_and_poses_come_back_to_the_worlds_own_size(tmp_path: Path, form:
     assert capture.points is not None
     assert capture.points.xyz.tolist() == [[2, 4, 6]]
     assert capture.points.rgb.tolist() == [[4, 5, 6]]
+    (doubt,) = open_capture(write(tmp_path, ply_file_path="gone.ply")).doubts
+    assert "gone.ply is missing" in doubt
 
 
 def test_synthetic_scenes_have_three_files(tmp_path: Path) -> None:
@@ -184,9 +227,16 @@ def test_synthetic_scenes_have_three_files(tmp_path: Path) -> None:
 
 def test_a_lost_pose_and_a_missing_image_are_lost_frames(tmp_path: Path) -> None:
     nan = np.full((4, 4), np.nan).tolist()
-    capture = open_capture(
-        write(tmp_path, _frame("a"), _frame("b") | {"transform_matrix": nan}, _frame("c"))
-    )
+    for pose in (nan, None):
+        capture = open_capture(
+            write(tmp_path, _frame("a"), _frame("b") | {"transform_matrix": pose}, _frame("c"))
+        )
+        assert len(capture.lost) == 2
+    with pytest.raises(UserError, match=r"frame 1 \(images/b.png\) has no transform_matrix"):
+        capture.frame("b")
+    with pytest.raises(UserError, match="has no transform_matrix") as error:
+        open_capture(write(tmp_path, {"transform_matrix": None}))
+    assert error.value.where == tmp_path / "transforms.json"
     assert {id: lost.reason for id, lost in capture.lost.items()} == {
         "b": "no pose",
         "c": "no image",
@@ -232,6 +282,31 @@ def test_nonsense_is_one_error_that_names_the_file(
     with pytest.raises(UserError) as error:
         open_capture(folder)
     assert error.value.where == folder / "transforms.json"
+
+
+@pytest.mark.parametrize(
+    ("root", "frame", "what"),
+    [
+        ({"fl_x": "9"}, {}, "it has a fl_x"),
+        ({"w": 0}, {}, "it has a size"),
+        ({}, {"fl_x": "9"}, "frame 0 (images/a.png) has a fl_x"),
+        ({"cx": "4"}, {"fl_x": 9}, "it has a cx"),
+        ({"fl_x": None}, {}, "it has no focal length"),
+        ({"fl_x": None, "camera_angle_x": 57.17}, {}, "57.17, not between 0 and pi (degrees? say"),
+    ],
+)
+def test_what_is_wrong_is_said_where_it_stands(
+    tmp_path: Path, root: dict[str, Any], frame: dict[str, Any], what: str
+) -> None:
+    with pytest.raises(UserError) as error:
+        open_capture(write(tmp_path, frame, **root))
+    assert what in error.value.what
+
+
+def test_an_empty_file_is_said_to_be_empty(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_bytes(b"\n")
+    with pytest.raises(UserError, match="is empty"):
+        open_capture(tmp_path)
 
 
 @pytest.mark.parametrize(

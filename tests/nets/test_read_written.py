@@ -51,6 +51,15 @@ def test_a_capture_is_read_as_it_was_written(layout: str, scene: Scene, tmp_path
             assert np.allclose(frame.read_depth(), depth, rtol=5e-4, atol=0)
 
 
+def test_polycams_images_stand_in_for_corrected_ones_with_a_warning(
+    scene: Scene, tmp_path: Path
+) -> None:
+    keyframes = WRITERS["Polycam"](tmp_path, scene).path / "keyframes"
+    (keyframes / "corrected_images").rename(keyframes / "images")
+    capture = open_capture(tmp_path)
+    assert len(capture.frames) == NUM and "corrected_images is missing" in capture.doubts[-1]
+
+
 def test_points_and_their_observations_are_read(scene: Scene, tmp_path: Path) -> None:
     for layout, pixels in {
         "OpenSfM": [[47.5, 15.5]],

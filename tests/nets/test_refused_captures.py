@@ -1,5 +1,6 @@
 """What is no capture yet is called by its name, and told the way to go."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,9 @@ LAYOUTS = {
     "deltas depth": ("summary.json", "depth/0.png"),
     "NeuS": ("cameras_sphere.npz", "image/0.png"),
     "SDFStudio": ("meta_data.json",),
+    "NSVF": ("rgb/0_0.png", "pose/0_0.txt", "intrinsics.txt", "bbox.txt"),
+    "NeRF++": ("rgb/0.png", "pose/0.txt", "intrinsics/0.txt"),
+    "RTAB-Map": ("walk_rgb/0.jpg", "walk_depth/0.png", "walk_calib/0.yaml", "walk_poses.txt"),
     "Record3D": ("metadata", "rgbd/0.jpg"),
     "MicMac": ("Ori-Calib/Orientation-0.jpg.xml",),
     "MVSNet": ("Cameras/pair.txt", "Rectified/scan1/0.png"),
@@ -100,6 +104,31 @@ def test_photos_without_poses_are_told_what_finds_them(inside: str, tmp_path: Pa
         open_capture(tmp_path)
     assert "3 photos" in error.value.what and "colmap" in error.value.remedy
     assert error.value.where == tmp_path / inside and "frames.json" in error.value.remedy
+
+
+def test_folders_called_after_depth_are_the_last_for_photos(tmp_path: Path) -> None:
+    _photos(tmp_path / "a_depth", 5)
+    _photos(tmp_path / "a_rgb")
+    for folder, number in (("a_rgb", 3), ("a_depth", 5)):
+        with pytest.raises(UserError, match=f"{number} photos") as error:
+            open_capture(tmp_path)
+        assert error.value.where == tmp_path / folder
+        shutil.rmtree(tmp_path / folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("Frames.json", "frames.json"), ("transform.json", "transforms.json")],
+)
+def test_a_file_that_is_nearly_called_as_known_is_named(
+    tmp_path: Path, name: str, meant: str
+) -> None:
+    _photos(tmp_path)
+    (tmp_path / name).write_text("{}")
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(UserError) as error:
+            open_capture(path)
+        assert error.value.where == tmp_path / name and f"rename it {meant}" in error.value.remedy
 
 
 @pytest.mark.parametrize("to", ["own", "colmap", "colmap elsewhere", "transforms", "scannet"])

@@ -52,14 +52,14 @@ def read(path: Path) -> Capture:
     for capture, (folder, count) in product(found.captures, found.models):
         if count == most:
             model = read_model(folder)
-            images = _find_images(folder, model, capture)
-            tried.append(
-                (sum(image is not None for image in images), folder, model, images, capture)
-            )
-            if tried[-1][0] == len(images):
+            images, guesses = _find_images(folder, model, capture)
+            there = sum(image is not None for image in images)
+            tried.append((there, folder, model, images, guesses, capture))
+            if there == len(images):
                 break
-    _, folder, model, images, capture = max(tried, key=lambda each: each[0])
+    _, folder, model, images, guesses, capture = max(tried, key=lambda each: each[0])
     read = capture_of_model(model, images, folder, capture)
+    read = replace(read, doubts=(*guesses, *read.doubts))
     rest = [f"{other.name} ({count})" for other, count in found.models if other != folder]
     if not rest:
         return read
@@ -67,11 +67,14 @@ def read(path: Path) -> Capture:
     return replace(read, doubts=(doubt, *read.doubts))
 
 
-def _find_images(folder: Path, model: ColmapModel, capture: Path) -> list[Path | None]:
+def _find_images(
+    folder: Path, model: ColmapModel, capture: Path
+) -> tuple[list[Path | None], list[str]]:
+    """The images of a model, None where there is none, and a warning of those that are guessed."""
     around = [each for each in (folder, *folder.parents) if each.is_relative_to(capture)]
     roots = [each / name for each in around for name in IMAGE_FOLDERS]
     finder = FileFinder(capture, [*roots, *around])
-    return [finder.find(name) for name in model.images.names]
+    return [finder.find(name) for name in model.images.names], finder.doubts()
 
 
 def capture_of_model(

@@ -73,9 +73,21 @@ def read_model(folder: Path) -> ColmapModel:
     """The model of a folder, binary where both kinds are there, as COLMAP reads it.
 
     Raises:
-        UserError: a file is missing or malformed.
+        UserError: a file is missing or malformed, or the files are of both kinds.
     """
+    _check_one_kind(folder)
     return read_binary_model(folder) if is_binary(folder) else read_text_model(folder)
+
+
+def _check_one_kind(folder: Path) -> None:
+    """Refuse a model of which a file is there as the other kind alone."""
+    wanted, other = (".bin", ".txt") if is_binary(folder) else (".txt", ".bin")
+    for stem in STEMS[:2]:
+        missing, instead = (folder / f"{stem}{suffix}" for suffix in (wanted, other))
+        if not missing.is_file() and instead.is_file():
+            what = f"the model mixes {wanted} and {other}: it has {instead.name}, no {missing.name}"
+            remedy = "export all files as one kind (colmap model_converter --output_type TXT)"
+            raise UserError(what, folder, remedy)
 
 
 def is_binary(folder: Path) -> bool:
@@ -135,11 +147,10 @@ def _has_other_poses(folder: Path) -> bool:
 
 
 def _is_model(path: Path) -> bool:
-    """Whether two of the three files are there: a model may lack points, or be broken."""
-    return any(
-        sum((path / f"{stem}{suffix}").is_file() for stem in STEMS) >= 2
-        for suffix in (".bin", ".txt")
-    )
+    """Whether two of the three files are there: a model may lack points, or be broken or mixed."""
+    kinds = (".bin", ".txt")
+    there = (any((path / f"{stem}{kind}").is_file() for kind in kinds) for stem in STEMS)
+    return sum(there) >= 2
 
 
 def _capture_of(model: Path, start: Path) -> Path:

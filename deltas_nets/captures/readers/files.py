@@ -1,12 +1,14 @@
 """Files that a capture names, found by name though they may have moved."""
 
 import os
+import re
 import stat
+import unicodedata
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from deltas_nets.captures.readers.names import IMAGE_SUFFIXES, name_parts
+from deltas_nets.captures.readers.names import IMAGE_SUFFIXES, name_parts, where_to_put
 from deltas_nets.errors import UserError
 
 __all__ = ["NOT_COLOUR", "FileFinder"]
@@ -22,9 +24,11 @@ class FileFinder:
     """Finds the files that a capture names, though they may have moved since.
 
     A name is looked up as it stands from each root. If nothing is there, the file is searched
-    under the roots by the last parts of its name, whatever the case of the letters, with a suffix
-    added where it has none. The file that agrees in most parts is taken, then the one under an
-    earlier root; where two are as good none is.
+    under the roots by the last parts of its name, whatever the case of the letters and the form in
+    which accents are written (macOS writes them apart), with a suffix added where it has none. The
+    file that agrees in most parts is taken, then the one under an earlier root; where two are as
+    good none is, but for copies in images_2, images_4, ..., of which the largest is. An image whose
+    suffix alone is another is taken from the folder that is named. `doubts` tells of both.
 
     Found files are in the folder of the capture or, if the name says so by "..", in the one around
     it, and never elsewhere: absolute paths are searched by their last parts, too. Links to files
@@ -54,13 +58,44 @@ class FileFinder:
         self.suffixes = tuple(suffixes)
         self.avoid = tuple(avoid)
         self._folders: dict[str, frozenset[str]] = {}
+        self._guesses: list[tuple[str, Path]] = []
+        self._missing: list[str] = []
 
-    def find(self, name: str) -> Path | None:
-        """The file for a name; None where there is none, or no telling which."""
+    def find(self, name: str, *, apart_from: Path | None = None) -> Path | None:
+        """The file for a name; None where there is none, or no telling which.
+
+        Args:
+            name: as the capture has it.
+            apart_from: a file that is known to be something else, as the image beside the depth.
+        """
         parts = name_parts(name)
         if not parts:
             return None
-        return self._as_named(name) or self._by_last_parts(parts)
+        found = self._as_named(name)
+        if found is None:
+            wanted = tuple(map(_folded, parts))
+            found = self._by_last_parts(name, wanted) or self._by_another_suffix(name, wanted)
+        if found is None or found == apart_from:
+            self._missing.append(name)
+            return None
+        return found
+
+    def doubts(self) -> list[str]:
+        """A warning of the images that were taken for others, if there are any."""
+        if not self._guesses:
+            return []
+        (name, path), count = self._guesses[0], len(self._guesses)
+        more = f", and {count - 1} more like it" if count > 1 else ""
+        return [f"{path} is taken for {name[:80]}, which is not there{more}"]
+
+    def doubts_of_missing(self, called: str) -> list[str]:
+        """A warning of the files that were not found, if there are any, by what they are called."""
+        if not self._missing:
+            return []
+        count = len(self._missing)
+        more = f", as are {count - 1} more" if count > 1 else ""
+        where = f"the {called} {self._missing[0][:80]} is missing{more}, {self.folder}"
+        return [f"{where}: {where_to_put(self._missing[0])}"]
 
     def _as_named(self, name: str) -> Path | None:
         relative = name.replace("\\", "/")
@@ -99,36 +134,56 @@ class FileFinder:
         around = os.path.dirname(os.path.abspath(self.folder))
         return os.path.abspath(file).startswith(os.path.join(around, ""))
 
-    def _by_last_parts(self, parts: Sequence[str]) -> Path | None:
-        lower = [part.lower() for part in parts]
-        names = [lower[-1]]
-        if not lower[-1].endswith(self.suffixes):
-            names = [lower[-1] + known for known in self.suffixes]
-        for name in names:
-            wanted = (*lower[:-1], name)
-            ranked = [
-                (_agreeing(found, wanted), -rank, path) for rank, found, path in self._known(name)
-            ]
-            if ranked:
-                best = max(key for *key, _ in ranked)
-                winners = [path for *key, path in ranked if key == best]
-                return winners[0] if len(winners) == 1 else None
+    def _by_last_parts(self, name: str, wanted: Sequence[str]) -> Path | None:
+        names = [wanted[-1]]
+        if not names[0].endswith(self.suffixes):
+            names = [names[0] + known for known in self.suffixes]
+        for last in names:
+            winners = self._nearest((*wanted[:-1], last))
+            largest = winners[0] if len(winners) == 1 else _largest_copy(winners)
+            if len(winners) > 1 and largest is not None:
+                self._guesses.append((name, largest))
+            if winners:
+                return largest
         return None
+
+    def _nearest(self, wanted: Sequence[str]) -> list[Path]:
+        """The files of a name that agree with it in most parts."""
+        known = self._known(wanted[-1])
+        ranked = [(_agreeing(found, wanted), -rank, path) for rank, found, path in known]
+        best = max((key for *key, _ in ranked), default=None)
+        return [path for *key, path in ranked if key == best]
+
+    def _by_another_suffix(self, name: str, wanted: Sequence[str]) -> Path | None:
+        """The one image in the folder that is named whose suffix alone is another."""
+        stem, suffix = os.path.splitext(wanted[-1])
+        if self.suffixes != IMAGE_SUFFIXES or suffix not in self.suffixes:
+            return None
+        found = [
+            path
+            for other in self.suffixes
+            for _, parts, path in self._known(stem + other)
+            if (parts[-2:-1] == tuple(wanted[-2:-1]) if wanted[:-1] else path.parent in self.roots)
+        ]
+        if len(found) != 1:
+            return None
+        self._guesses.append((name, found[0]))
+        return found[0]
 
     def _known(self, name: str) -> Sequence[tuple[int, tuple[str, ...], Path]]:
         return self._index.get(name, ())
 
     @cached_property
     def _index(self) -> dict[str, list[tuple[int, tuple[str, ...], Path]]]:
-        """By lower name: the root's rank, the lower parts from there, the file."""
+        """By folded name: the root's rank, the folded parts from there, the file."""
         index: dict[str, list[tuple[int, tuple[str, ...], Path]]] = {}
         seen: set[str] = set()
         for rank, root in enumerate(self.roots):
             for folder, file in _walk(root, self.avoid, seen):
                 if file.lower().endswith(self.suffixes):
                     path = Path(folder, file)
-                    parts = tuple(part.lower() for part in path.relative_to(root.parent).parts)
-                    index.setdefault(file.lower(), []).append((rank, parts, path))
+                    parts = tuple(map(_folded, path.relative_to(root.parent).parts))
+                    index.setdefault(parts[-1], []).append((rank, parts, path))
         return index
 
 
@@ -148,6 +203,21 @@ def _walk(root: Path, avoid: tuple[str, ...], seen: set[str]) -> Iterator[tuple[
             raise UserError(what, root, "name the folder of one capture")
         for file in sorted(files):
             yield folder, file
+
+
+def _folded(name: str) -> str:
+    """A name without case, its accents in one form: macOS writes a letter and its accent apart."""
+    return (name if name.isascii() else unicodedata.normalize("NFC", name)).lower()
+
+
+def _largest_copy(files: Sequence[Path]) -> Path | None:
+    """Of one image in images_2, images_4, ... the least reduced; None where they are others."""
+    names = [re.fullmatch(r"images_(\d{1,4})", file.parent.name) for file in files]
+    factors = [int(name[1]) for name in names if name is not None]
+    beside = len({file.parent.parent for file in files}) == 1
+    if not beside or len(set(factors)) < len(files):
+        return None
+    return files[factors.index(min(factors))]
 
 
 def _agreeing(found: Sequence[str], wanted: Sequence[str]) -> int:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,15 +28,18 @@ def read_json(path: Path, *, name: str, remedy: str, limit: int = JSON_LIMIT) ->
         limit: bytes that it may have.
 
     Raises:
-        UserError: it cannot be read, is larger, no UTF-8 or no JSON, nested too deeply, or names
-            one thing twice.
+        UserError: it cannot be read, is empty, larger, no UTF-8 or no JSON, nested too deeply, or
+            names one thing twice.
     """
     try:
         size = path.stat().st_size
         if size > limit:
             what = f"the {name} file has {size / 2**20:.0f} MiB, more than {limit / 2**20:g}"
             raise UserError(what, path, remedy)
-        return json.loads(path.read_bytes().decode("utf-8-sig"), object_pairs_hook=_once)
+        text = path.read_bytes().decode("utf-8-sig")
+        if not text.strip():
+            raise UserError(f"the {name} file is empty", path, remedy)
+        return json.loads(text, object_pairs_hook=_once)
     except OSError as error:
         what = f"the {name} file cannot be read ({error.strerror or error})"
         raise UserError(what, path, remedy) from error
@@ -63,20 +67,51 @@ class Fields:
         path: the file, for errors.
         where: what the object is, for errors, as "frame 3".
         remedy: what the user can do.
+        said_by: what else says a value, for errors, by its key.
 
     Raises:
         UserError: it is no object.
     """
 
-    def __init__(self, values: object, path: Path, *, where: str, remedy: str) -> None:
+    def __init__(
+        self,
+        values: object,
+        path: Path,
+        *,
+        where: str,
+        remedy: str,
+        said_by: Mapping[str, str] | None = None,
+    ) -> None:
         self.path, self.where, self.remedy = path, where, remedy
+        self._said_by = said_by or {}
         if not isinstance(values, dict):
             raise self.error("is no JSON object")
         self.values: dict[str, object] = values
 
-    def error(self, what: str) -> UserError:
-        """An error about the object."""
-        return UserError(f"{self.where} {what}", self.path, self.remedy)
+    @classmethod
+    def merged(cls, layers: Sequence["Fields"], keys: Sequence[str]) -> "Fields":
+        """The values of some keys, those of later layers before those of earlier ones.
+
+        Errors name the layer that says a value; of one that is missing, the last that says any.
+        """
+        values: dict[str, object] = {}
+        said_by: dict[str, str] = {}
+        where = layers[0].where
+        for layer in layers:
+            found = [key for key in keys if key in layer]
+            values |= {key: layer.values[key] for key in found}
+            said_by |= dict.fromkeys(found, layer.where)
+            where = layer.where if found else where
+        last = layers[-1]
+        return cls(values, last.path, where=where, remedy=last.remedy, said_by=said_by)
+
+    def error(self, what: str, key: str = "") -> UserError:
+        """An error about the object, or about what says the value of a key."""
+        return UserError(f"{self.where_of(key)} {what}", self.path, self.remedy)
+
+    def where_of(self, key: str) -> str:
+        """What says the value of a key, for errors."""
+        return self._said_by.get(key, self.where)
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None
@@ -95,7 +130,7 @@ class Fields:
         """
         found = self.values.get(key, [])
         if not isinstance(found, list):
-            raise self.error(f"has no list {key}")
+            raise self.error(f"has no list {key}", key)
         return found
 
     def text(self, key: str, default: str | None = None) -> str:
@@ -107,7 +142,7 @@ class Fields:
         found = self.values.get(key, default)
         if not isinstance(found, str):
             raise self.error(
-                f"has no text {key}" if found is None else f"has a {key} that is no text"
+                f"has no text {key}" if found is None else f"has a {key} that is no text", key
             )
         return found
 
@@ -119,7 +154,7 @@ class Fields:
         """
         found = self.values.get(key)
         if not isinstance(found, bool | None):
-            raise self.error(f"has a {key} that is neither true nor false")
+            raise self.error(f"has a {key} that is neither true nor false", key)
         return bool(found)
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -156,9 +191,9 @@ class Fields:
         if array is None:
             form = " x ".join("any" if size < 0 else str(size) for size in shape)
             wanted = f"{form} numbers" if shape else "a number"
-            raise self.error(f"has a {key} that is not {wanted}")
+            raise self.error(f"has a {key} that is not {wanted}", key)
         if finite and not np.isfinite(array).all():
-            raise self.error(f"has a {key} that is not finite")
+            raise self.error(f"has a {key} that is not finite", key)
         return array
 
 

@@ -83,7 +83,7 @@ def read(path: Path) -> Capture:
         pose = cam_from_world(matrix, id=id, path=folder / "trajectories.txt")
         sensor = sensors[device]
         found.add(photo, pose, sensor.K, stated=sensor.size, lens=sensor.lens)
-    capture = found.capture(path, "kapture", metric=False)
+    capture = found.capture(path, "kapture", metric=False, doubts=finder.doubts())
     return replace(capture, points=_points(path / "reconstruction" / "points3d.txt"))
 
 

@@ -14,6 +14,7 @@ __all__ = [
     "check_ids",
     "frame_ids",
     "name_parts",
+    "where_to_put",
     "without_common_folder",
 ]
 
@@ -40,6 +41,19 @@ def name_parts(name: str) -> tuple[str, ...]:
     if name[1:2] == ":":
         name = name[2:]
     return tuple(part for part in name.split("/") if part not in ("", ".", ".."))
+
+
+def where_to_put(name: str) -> str:
+    """What to do about a file of that name which is not found, in words.
+
+    Example:
+        >>> where_to_put("images/1.png")
+        'put it where the file says'
+    """
+    name = name.replace("\\", "/")
+    if name.startswith("/") or name[1:2] == ":" or ".." in name.split("/"):
+        return "copy or link it into the capture's folder: paths that lead out are not followed"
+    return "put it where the file says"
 
 
 def without_common_folder(names: Sequence[str]) -> list[str]:

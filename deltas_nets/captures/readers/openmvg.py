@@ -73,7 +73,7 @@ def read(path: Path) -> Capture:
         if photo is not None:
             K, lens = cameras[view.intrinsic]
             found.add(photo, _pose(poses[view.pose], id), K, stated=view.size, lens=lens)
-    capture = found.capture(folder, "OpenMVG", metric=False)
+    capture = found.capture(folder, "OpenMVG", metric=False, doubts=finder.doubts())
     place = {id: position for position, id in enumerate(capture.frames)}
     position = {view.key: place[id] for view, id in zip(views, ids, strict=True) if id in place}
     return replace(capture, points=_points(scene, position))

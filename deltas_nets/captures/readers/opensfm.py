@@ -76,7 +76,7 @@ def read(path: Path) -> Capture:
             raise shot.error(f"is of the camera {called[:60]!r}, which there is not")
         stated, K, lens = cameras[called]
         found.add(photo, _pose(shot, id), K, stated=stated, lens=lens)
-    doubts = []
+    doubts = finder.doubts()
     if len(each) > 1:
         doubts.append(
             f"the largest of {len(each)} reconstructions is read, with {len(names)} images, {file}"

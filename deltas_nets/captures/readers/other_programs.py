@@ -4,7 +4,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["COLMAP", "LAYOUTS", "MODELS", "OWN", "RECORDINGS", "TEXTS", "Layout", "Rule"]
+__all__ = [
+    "COLMAP",
+    "LAYOUTS",
+    "MAIN_FILES",
+    "MODELS",
+    "OWN",
+    "RECORDINGS",
+    "TEXTS",
+    "Layout",
+    "Rule",
+]
 
 COLMAP = (
     "colmap automatic_reconstructor --dense 0 --workspace_path {folder} --image_path {images} "
@@ -122,6 +132,22 @@ LAYOUTS: tuple[Layout, ...] = (
         f"{OWN}: camtoworld of meta_data.json is its world_from_cam, intrinsics its K",
     ),
     Layout(
+        "a scene of NSVF",
+        ("rgb", "pose", "bbox.txt"),
+        f"{OWN}: a file of pose is camera-to-world, intrinsics.txt has the K",
+    ),
+    Layout(
+        "a scene of NeRF++",
+        ("rgb", "pose", "intrinsics"),
+        f"{OWN}: a file of pose is camera-to-world, a file of intrinsics the K",
+    ),
+    Layout(
+        "an export of RTAB-Map's",
+        ("*_rgb", "*_calib", "*poses*.txt"),
+        f"{OWN}: poses of the camera (not of the robot's base) are camera-to-world, a file of the "
+        "folder calib has the K",
+    ),
+    Layout(
         "an unpacked recording of Record3D",
         ("metadata", "rgbd"),
         "in Record3D export it as EXR and JPEG sequence, and name the folder it writes",
@@ -203,6 +229,12 @@ RECORDINGS: tuple[Rule, ...] = (
     ),
 )  # fmt: skip
 """What is no capture only where nothing else is there."""
+
+MAIN_FILES = (
+    "frames.json", "frames.csv", "transforms.json", "reconstruction.json", "sfm_data.json",
+    "poses_bounds.npy", "groundtruth.txt",
+)  # fmt: skip
+"""By which captures are known; one of nearly that name may be meant to be it."""
 
 TEXTS = (".nvm", ".xml", ".csv", ".out", ".xmp")
 """Suffixes of files that only their first bytes tell apart."""

@@ -14,7 +14,13 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
 from deltas_nets.captures.readers.json_file import Fields, read_json
-from deltas_nets.captures.readers.names import DEPTH_SUFFIXES, check_ids, frame_ids, name_parts
+from deltas_nets.captures.readers.names import (
+    DEPTH_SUFFIXES,
+    check_ids,
+    frame_ids,
+    name_parts,
+    where_to_put,
+)
 from deltas_nets.captures.readers.own_cameras import (
     OwnCamera,
     depth_camera,
@@ -59,7 +65,8 @@ def read(path: Path) -> Capture:
     files = [path] if path.is_file() else [path / name for name in NAMES]
     file = next(file for file in files if file.is_file())
     root = _root(file)
-    entries = _entries(root, file)
+    finder = FileFinder(file.parent, [file.parent / "images"])
+    entries = _entries(root, file, finder)
     images: dict[OwnCamera, list[Path]] = {}
     for entry in entries:
         images.setdefault(entry.camera, []).extend([entry.image] if entry.image else [])
@@ -82,7 +89,11 @@ def read(path: Path) -> Capture:
         path=file.parent,
         frames=packed,
         lost=lost,
-        doubts=tuple(doubts_of_sizes(cameras.values())),
+        doubts=(
+            *finder.doubts(),
+            *doubts_of_sizes(cameras.values()),
+            *depths.doubts_of_missing("depth"),
+        ),
         layout=file.name,
         metric=is_metric(root),
         points=read_points(root, file.parent, ids, packed, scales),
@@ -91,19 +102,21 @@ def read(path: Path) -> Capture:
     )
 
 
-def _entries(root: Fields, file: Path) -> list[_Entry]:
+def _entries(root: Fields, file: Path, finder: FileFinder) -> list[_Entry]:
     fields = [
         Fields(values, file, where=f"frame {index}", remedy=REMEDY)
         for index, values in enumerate(root.items("frames"))
     ]
     for frame in fields:
         check_keys(frame, FRAME)
-    finder = FileFinder(file.parent, [file.parent / "images"])
     cameras = named_cameras(root)
-    return [
-        _Entry(id, frame, finder.find(frame.text("image")), stated_camera(root, frame, cameras))
-        for id, frame in zip(_ids(fields, file), fields, strict=True)
-    ]
+    entries = []
+    for id, frame in zip(_ids(fields, file), fields, strict=True):
+        image = frame.text("image")
+        frame.where = f"{frame.where} ({image[:80]})"
+        camera = stated_camera(root, frame, cameras)
+        entries.append(_Entry(id, frame, finder.find(image), camera))
+    return entries
 
 
 def _frame(entry: _Entry, camera: SizedCamera, root: Fields, depths: FileFinder) -> Frame | Lost:
@@ -113,8 +126,9 @@ def _frame(entry: _Entry, camera: SizedCamera, root: Fields, depths: FileFinder)
     if isinstance(pose, Lost):
         return pose
     if entry.image is None:
-        what = f"{fields.where}: the image {fields.text('image')[:80]} is missing"
-        return Lost("no image", UserError(what, fields.path, "put it where the file says"))
+        name = fields.text("image")
+        what = f"the image {name[:80]} is missing"
+        return Lost("no image", UserError(what, fields.path, where_to_put(name)))
     frame = Frame(
         id=entry.id,
         image_path=entry.image,
@@ -123,7 +137,9 @@ def _frame(entry: _Entry, camera: SizedCamera, root: Fields, depths: FileFinder)
         cam_from_world=pose,
         lens=camera.lens,
     )
-    depth = depths.find(fields.text("depth")) if "depth" in fields else None
+    if "depth" not in fields:
+        return frame
+    depth = depths.find(fields.text("depth"), apart_from=entry.image)
     if depth is None:
         return frame
     scale = (fields if "depth_scale" in fields else root).number("depth_scale", MILLIMETRES)

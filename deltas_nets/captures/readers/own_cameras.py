@@ -60,7 +60,7 @@ def stated_camera(root: Fields, frame: Fields, named: Mapping[str, Fields]) -> O
     Raises:
         UserError: it names a camera that there is not, or the camera lacks a number.
     """
-    values = {key: root.values[key] for key in CAMERA if key in root}
+    layers = [root]
     if "camera" in frame:
         name = frame.text("camera")
         if name not in named:
@@ -69,11 +69,8 @@ def stated_camera(root: Fields, frame: Fields, named: Mapping[str, Fields]) -> O
                 f"is of a camera {name[:40]!r}, which is not in cameras"
                 + (f" (did you mean {near[0]}?)" if near else "")
             )
-        values |= named[name].values
-    values |= {key: frame.values[key] for key in CAMERA if key in frame}
-    return _camera(
-        Fields(values, frame.path, where=frame.where, remedy=frame.remedy), _offset(root)
-    )
+        layers.append(named[name])
+    return _camera(Fields.merged((*layers, frame), CAMERA), _offset(root))
 
 
 def _offset(root: Fields) -> float:
@@ -86,7 +83,7 @@ def _offset(root: Fields) -> float:
 def _camera(values: Fields, offset: float) -> OwnCamera:
     fx, fy = values.number("fx"), values.number("fy")
     if min(fx, fy) <= 0:
-        raise values.error(f"has focal lengths that are not positive ({fx:g} and {fy:g})")
+        raise values.error(f"has focal lengths that are not positive ({fx:g} and {fy:g})", "fx")
     centre = values.number("cx") - offset, values.number("cy") - offset
     return OwnCamera((fx, fy), centre, _lens(values), _size(values))
 
@@ -97,18 +94,18 @@ def _lens(values: Fields) -> Lens | None:
     )
     if "lens" not in values:
         if numbers:
-            raise values.error("has coefficients, but no lens")
+            raise values.error("has coefficients, but no lens", "coefficients")
         return None
     name = values.text("lens")
     model = CAMERA_MODELS.get(name)
     if model is None:
         near = difflib.get_close_matches(name.upper(), CAMERA_MODELS, n=1, cutoff=0.4)
-        what = f"{values.where} has an unknown lens {name[:40]!r}"
+        what = f"{values.where_of('lens')} has an unknown lens {name[:40]!r}"
         remedy = f"did you mean {near[0]}?" if near else f"known are {', '.join(CAMERA_MODELS)}"
         raise UserError(what, values.path, remedy)
     if len(numbers) != model.num_coefficients:
         count = model.num_coefficients
-        raise values.error(f"has {len(numbers)} coefficients; {name} has {count}")
+        raise values.error(f"has {len(numbers)} coefficients; {name} has {count}", "coefficients")
     return None if model.straight and not any(numbers) else Lens(name, numbers)
 
 
@@ -117,7 +114,7 @@ def _size(values: Fields) -> tuple[int, int] | None:
         return None
     height, width = values.number("height"), values.number("width")
     if not all(1 <= side < 2**20 and side == int(side) for side in (height, width)):
-        raise values.error(f"has a size of {width:g} x {height:g} pixels")
+        raise values.error(f"has a size of {width:g} x {height:g} pixels", "width")
     return int(height), int(width)
 
 

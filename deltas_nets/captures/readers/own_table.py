@@ -94,8 +94,8 @@ def read_csv(path: Path) -> dict[str, object]:
     """The same as JSON would hold.
 
     Raises:
-        UserError: it cannot be read, is too large or no text, or a row has more cells than the
-            first.
+        UserError: it cannot be read, is too large, empty or no text, or a row has more cells than
+            the first.
     """
     try:
         if path.stat().st_size > FILE_LIMIT:
@@ -106,16 +106,19 @@ def read_csv(path: Path) -> dict[str, object]:
         raise UserError(what, path, REMEDY) from error
     except UnicodeDecodeError as error:
         raise UserError("the file is not text in UTF-8", path, REMEDY) from error
-    told = [line for line in lines if line.strip() and not line.startswith("#")]
-    # Spreadsheets of countries with decimal commas put semicolons between cells.
-    commas = bool(told) and ";" in told[0] and "," not in told[0]
+    if not any(line.strip() for line in lines):
+        raise UserError("the file is empty", path, REMEDY)
+    delimiter, lines = _delimiter(lines)
+    commas = delimiter != ","  # decimal ones are in files of countries that have them
     root: dict[str, object] = {}
     for line in lines:
-        stated = re.fullmatch(r"#\s*(\w+)\s*:\s*(.*?)\s*", line)
+        # Spreadsheets fill every line up to the width of the table.
+        stated = re.fullmatch(r"#\s*(\w+)\s*:\s*(.*?)\s*", line.rstrip(delimiter))
         if stated:
             root[stated[1]] = _value(stated[1], stated[2], commas)
     try:
-        rows = list(csv.reader(told, delimiter=";" if commas else ","))
+        table = csv.reader(_rows(lines), delimiter=delimiter)
+        rows = [row for row in table if any(cell.strip() for cell in row)]
     except csv.Error as error:
         raise UserError(f"the file is no CSV ({error})", path, REMEDY) from error
     header = [name.strip() for name in rows[0]] if rows else []
@@ -127,6 +130,21 @@ def read_csv(path: Path) -> dict[str, object]:
             raise UserError(what, path, REMEDY)
     root["frames"] = [_frame(dict(zip(header, row, strict=True)), commas) for row in rows[1:]]
     return root
+
+
+def _delimiter(lines: list[str]) -> tuple[str, list[str]]:
+    """What stands between cells, and the lines without the one that says it, as Excel's may."""
+    stated = re.fullmatch(r"sep=([,;\t])", lines[0].strip(" \r\n"))
+    if stated:
+        return stated[1], lines[1:]
+    # Spreadsheets of countries with decimal commas put semicolons; what is copied has tabs.
+    header = next(iter(_rows(lines)), "")
+    return next((mark for mark in ",;\t" if mark in header), ","), lines
+
+
+def _rows(lines: list[str]) -> list[str]:
+    """The lines that are no comments and not empty."""
+    return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
 def _frame(row: Mapping[str, str], commas: bool) -> dict[str, object]:

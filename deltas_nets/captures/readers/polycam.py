@@ -17,8 +17,13 @@ __all__ = ["read", "recognises"]
 
 _REMEDY = "export raw data from Polycam again"
 _JSON_LIMIT = 2**20
-_KINDS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
-"""Folders of cameras and their images: after the global optimisation, or as ARKit tracked."""
+_KINDS = (
+    ("corrected_cameras", "corrected_images"),
+    ("cameras", "images"),
+    ("corrected_cameras", "images"),
+)
+"""Folders of cameras and their images: after the global optimisation, as ARKit tracked, or both
+mixed where people copied a part."""
 
 
 def recognises(path: Path) -> bool:
@@ -36,6 +41,9 @@ def read(path: Path) -> Capture:
     doubts = []
     if cameras.name == "cameras":
         doubts.append(f"poses are as tracked, not optimised (no corrected_cameras), {folder}")
+    elif images.name == "images":
+        doubt = "corrected_images is missing: images are taken, whose lens is not undone"
+        doubts.append(f"{doubt}, {folder}")
     found = Collected(images)
     files = sorted(listed(cameras, ".json"))
     for file in files:

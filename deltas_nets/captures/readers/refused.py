@@ -1,6 +1,8 @@
 """What is no capture yet, recognised by name, and which program makes one of it."""
 
+import re
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from shlex import quote
@@ -11,6 +13,7 @@ from deltas_nets.captures.readers.names import IMAGE_SUFFIXES
 from deltas_nets.captures.readers.other_programs import (
     COLMAP,
     LAYOUTS,
+    MAIN_FILES,
     MODELS,
     OWN,
     RECORDINGS,
@@ -19,7 +22,7 @@ from deltas_nets.captures.readers.other_programs import (
 )
 from deltas_nets.errors import UserError
 
-__all__ = ["refusal"]
+__all__ = ["known_layout", "refusal"]
 
 _LOOKED_AT = 10_000
 """Entries of a folder."""
@@ -37,11 +40,12 @@ def refusal(path: Path) -> UserError | None:
         this is a video, not a capture
     """
     if not path.is_dir():
-        return _known([path], (*MODELS, *RECORDINGS), path)
+        return _known([path], (*MODELS, *RECORDINGS), path) or _misnamed([path])
     entries = _entries(path)
     return (
         _known(entries, MODELS, path)
-        or _layout(path)
+        or known_layout(path)
+        or _misnamed(entries)
         or _known(_below(entries), MODELS, path)
         or _photos(path)
         or _known(entries, RECORDINGS, path)
@@ -57,10 +61,21 @@ def _known(files: Sequence[Path], rules: Sequence[Rule], path: Path) -> UserErro
     return None
 
 
-def _layout(path: Path) -> UserError | None:
+def known_layout(path: Path) -> UserError | None:
+    """Why a folder that is known by what is in it is refused."""
     for called, holds, remedy in LAYOUTS:
         if all(next(path.glob(pattern), None) is not None for pattern in holds):
             return UserError(f"this is {called}, not a capture", path, _filled(remedy, path))
+    return None
+
+
+def _misnamed(files: Sequence[Path]) -> UserError | None:
+    """A file that is nearly called as one that captures are known by."""
+    for file in files:
+        near = get_close_matches(file.name.lower(), MAIN_FILES, n=1, cutoff=0.9)
+        if near and near[0] != file.name and file.is_file():
+            what = f"no capture is known by a file {file.name}"
+            return UserError(what, file, f"rename it {near[0]} if it is one")
     return None
 
 
@@ -71,7 +86,8 @@ def _below(entries: Sequence[Path]) -> list[Path]:
 
 
 def _photos(path: Path) -> UserError | None:
-    for folder in _folders(path):
+    # Those that are called after depth last: nothing else may be there.
+    for folder in sorted(_folders(path), key=_is_of_no_colour):
         inside = _entries(folder)
         photos = sum(each.suffix.lower() in IMAGE_SUFFIXES and each.is_file() for each in inside)
         if photos > 1:
@@ -92,6 +108,11 @@ def _folders(path: Path) -> Iterator[Path]:
 
 def _may_hold_photos(path: Path) -> bool:
     return path.is_dir() and not (path.is_symlink() or path.name.lower().startswith(NOT_COLOUR))
+
+
+def _is_of_no_colour(path: Path) -> bool:
+    """Whether a word of the name, as of NAME_depth, says that no photos are there."""
+    return any(word.startswith(NOT_COLOUR) for word in re.split("[_ -]", path.name.lower()))
 
 
 def _entries(folder: Path) -> list[Path]:

@@ -10,6 +10,7 @@ from deltas_nets.captures.capture import Capture, FloatArray, Frame, Lost
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrinsics
+from deltas_nets.captures.readers.refused import known_layout
 from deltas_nets.captures.readers.rigid import why_not_rigid
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
@@ -124,7 +125,10 @@ def _find_files(scene: Path) -> _SceneFiles:
     }
     for name, remedy in remedies.items():
         if not (scene / name).is_dir():
-            raise UserError(f"the capture has no folder {name}", scene, remedy)
+            # Layouts of radiance fields have a folder pose, too.
+            raise known_layout(scene) or UserError(
+                f"the capture has no folder {name}", scene, remedy
+            )
     images = _files_by_id(scene / "color", IMAGE_SUFFIXES)
     poses = _files_by_id(scene / "pose", (".txt",))
     depths = _files_by_id(scene / "depth", (".png",)) if (scene / "depth").is_dir() else {}

@@ -1,24 +1,27 @@
 """7-Scenes and its relatives: frame-000000.color.png, .depth.png and .pose.txt in one folder.
 
 In 7-Scenes, colour and depth are two cameras, the poses are those of the depth camera, and nothing
-is registered. 3DMatch and others took the layout over for depth that is registered to colour: they
-state intrinsics of their own.
+is registered. 3DMatch, BundleFusion, 3RScan and others took the layout over: they state intrinsics
+of their own, in camera-intrinsics.txt, info.txt or _info.txt.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.depth_files import MILLIMETRES
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of, in_words
-from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.images import in_words
+from deltas_nets.captures.readers.cameras import camera_matrix, fitted
+from deltas_nets.captures.readers.image_sizes import doubts_of_sizes, first_size
 from deltas_nets.captures.readers.intrinsics import read_intrinsics
 from deltas_nets.captures.readers.numbered import numbered_files
 from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images
+from deltas_nets.captures.readers.sensor_info import SensorInfo, read_sensor_info
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
@@ -32,16 +35,29 @@ ASIDE = 0.025
 published: edges of depth fall onto edges of colour with this offset, not with none or the other
 sign, and matches lie nearer to their epipolar lines."""
 SIZE = 480, 640
+DEPTHS = (".depth.png", ".depth.pgm")
 
 _REMEDY = "write 4 rows of 4 numbers (camera-to-world), or remove the file and its image"
 
 
 class _Sensor(NamedTuple):
-    """K of both cameras, and where the depth camera stands; None where they are one."""
+    """Both cameras.
+
+    Attributes:
+        K: ``(3, 3)`` of the colour camera at its images' size.
+        depth_K: ``(3, 3)`` of the depth camera; None where they are one.
+        depth_size: (height, width) of depth; None where any will do.
+        cam_from_depth: where the depth camera stands; None where they stand at one place.
+        depth_scale: steps of depth in a metre.
+        doubts: what may be a mistake, each for a warning.
+    """
 
     K: FloatArray
-    depth_K: FloatArray | None
-    cam_from_depth: FloatArray | None
+    depth_K: FloatArray | None = None
+    depth_size: tuple[int, int] | None = None
+    cam_from_depth: FloatArray | None = None
+    depth_scale: float = MILLIMETRES
+    doubts: tuple[str, ...] = ()
 
 
 def recognises(path: Path) -> bool:
@@ -55,20 +71,14 @@ def read(path: Path) -> Capture:
     lost: dict[str, Lost] = {}
     sequences = _sequences(path)
     files = {name: _colour(folder) for name, folder in sequences.items()}
-    sizes = (image_size_of(file) for images in files.values() for file in images.values())
-    image_size = next((size for size in sizes if size is not None), None)
-    if image_size is None:
+    first = first_size(file for images in files.values() for file in images.values())
+    if first is None:
         raise UserError("no image frame-000000.color.png can be decoded", path, "copy them again")
-    sensor = _sensor(path, sequences, image_size)
+    sensor = _sensor(path, sequences, first)
     for name, folder in sequences.items():
-        _read_sequence(name, folder, files[name], image_size, sensor, frames, lost)
-    doubts = []
-    if sensor.cam_from_depth is not None and any(frame.depth_path for frame in frames):
-        doubts.append(
-            "depth is of another camera, 25 mm aside, and is not registered to the colour images "
-            f"(7-Scenes as published), {path}: register it before it is compared with anything"
-        )
-    return Capture(path, Frames.of(frames, path), lost, tuple(doubts), "7-Scenes", metric=True)
+        _read_sequence(name, folder, files[name], first[1], sensor, frames, lost)
+    packed = Frames.of(frames, path)
+    return Capture(path, packed, lost, sensor.doubts, "7-Scenes", metric=True)
 
 
 def _read_sequence(
@@ -81,7 +91,7 @@ def _read_sequence(
     lost: dict[str, Lost],
 ) -> None:
     poses = numbered_files(folder, (".pose.txt",), "frame-")
-    depths = numbered_files(folder, (".depth.png",), "frame-")
+    depths = numbered_files(folder, DEPTHS, "frame-")
     missing = []
     for number in sorted(images.keys() | poses.keys()):
         id = f"{name}{number:06d}"
@@ -102,8 +112,9 @@ def _read_sequence(
                 cam_from_world=pose,
                 depth_path=depth,
                 depth_K=None if depth is None else sensor.depth_K,
-                depth_size=None if depth is None or sensor.depth_K is None else SIZE,
+                depth_size=None if depth is None else sensor.depth_size,
                 cam_from_depth=None if depth is None else sensor.cam_from_depth,
+                depth_scale=sensor.depth_scale,
             )
         )
     lost |= missing_images(missing, folder)
@@ -126,28 +137,60 @@ def _pose(path: Path | None, id: str, folder: Path, sensor: _Sensor) -> FloatArr
     return sensor.cam_from_depth @ pose
 
 
-def _sensor(path: Path, sequences: Mapping[str, Path], image_size: tuple[int, int]) -> _Sensor:
-    places = {path, path.parent, *sequences.values()}
-    stated = next(
-        (
-            file
-            for place in sorted(places, reverse=True)
-            if (file := place / "camera-intrinsics.txt").is_file()
-        ),
-        None,
-    )
+def _sensor(
+    path: Path, sequences: Mapping[str, Path], first: tuple[Path, tuple[int, int]]
+) -> _Sensor:
+    """The cameras as a file beside the images states them, else those of 7-Scenes.
+
+    Args:
+        path: the folder that was named.
+        sequences: the folders of frames in it.
+        first: an image that can be read, and its (height, width).
+    """
+    places = sorted({path, path.parent, *sequences.values()}, reverse=True)
+    files = (place / "camera-intrinsics.txt" for place in places)
+    stated = next((file for file in files if file.is_file()), None)
     depth_K = camera_matrix(DEPTH_FOCAL, DEPTH_FOCAL, 320, 240, path=path)
     if stated is not None:
         K = read_intrinsics(stated, None)
         if not np.allclose(K, depth_K, rtol=0, atol=0.5):
-            return _Sensor(K, None, None)
-    if image_size != SIZE:
-        what = f"images are {in_words(image_size)}, those of 7-Scenes are 640x480"
+            return _Sensor(K)
+    else:
+        said = [info for place in places if (info := read_sensor_info(place)) is not None]
+        if said:
+            return _stated_sensor(said[0], sequences.values(), *first)
+    if first[1] != SIZE:
+        what = f"images are {in_words(first[1])}, those of 7-Scenes are 640x480"
         raise UserError(what, path, "write camera-intrinsics.txt with the 3x3 matrix beside them")
     cam_from_depth = np.eye(4)
     cam_from_depth[0, 3] = -ASIDE
     K = camera_matrix(COLOUR_FOCAL, COLOUR_FOCAL, 320, 240, path=path)
-    return _Sensor(K, depth_K, cam_from_depth)
+    doubt = (
+        "the cameras are taken to be those of 7-Scenes as published (fx 525 of colour, 585 of "
+        f"depth, 25 mm aside, not registered), {path}: write camera-intrinsics.txt if they are "
+        "others, and register depth before it is compared with anything"
+    )
+    return _Sensor(K, depth_K, SIZE, cam_from_depth, doubts=(doubt,))
+
+
+def _stated_sensor(
+    info: SensorInfo, sequences: Iterable[Path], image: Path, size: tuple[int, int]
+) -> _Sensor:
+    """The cameras of a sensor's info, the colour camera's at the size of its images."""
+    camera = fitted(info.K, info.size or size, size, image=image)
+    depths = (numbered_files(folder, DEPTHS, "frame-").values() for folder in sequences)
+    first_depth = first_size(file for files in depths for file in files)
+    doubts = doubts_of_sizes([camera])
+    if info.moved:
+        doubts.append(f"the cameras of colour and depth are taken to be one, {info.path}")
+    known = first_depth is not None and info.depth_K is not None
+    return _Sensor(
+        camera.K,
+        info.depth_K if known else None,
+        first_depth[1] if first_depth is not None and known else None,
+        depth_scale=info.depth_scale or MILLIMETRES,
+        doubts=tuple(doubts),
+    )
 
 
 def _colour(folder: Path) -> dict[int, Path]:

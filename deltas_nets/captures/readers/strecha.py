@@ -48,7 +48,7 @@ def read(path: Path) -> Capture:
         stated = int(sides[1]), int(sides[0])
         matrix = camera_matrix(K[0], K[4], K[2], K[5], path=file)
         found.add(photo, pose, matrix, stated=stated)
-    doubts = []
+    doubts = finder.doubts()
     if bent:
         doubts.append(f"{bent} cameras state a distortion, which is not undone, {path}")
     return found.capture(path, "Strecha", metric=False, doubts=doubts)

@@ -28,6 +28,7 @@ from deltas_nets.captures.readers.names import (
     DEPTH_SUFFIXES,
     frame_ids,
     name_parts,
+    where_to_put,
     without_common_folder,
 )
 from deltas_nets.captures.readers.ply import read_points
@@ -41,6 +42,11 @@ __all__ = ["read", "recognises"]
 NAME = "transforms.json"
 PARTS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 REMEDY = "export it again, or mend it by hand"
+DEPTHS = {
+    "depth_file_path": "depth_unit_scale_factor",
+    "depth_path": "integer_depth_scale",  # instant-ngp's words for the same
+}
+"""Keys of a frame's depth, and those of the root that say how long its steps are."""
 OPENGL = np.diag([1.0, -1, -1, 1])
 """Its camera's axes from ours, and ours from its."""
 
@@ -66,10 +72,12 @@ def read(path: Path) -> Capture:
     """Read the file, or all parts of it; see `deltas_nets.captures.opening.Reader`."""
     folder = path.parent if path.is_file() else path
     files = [path] if path.is_file() else _files(path)
-    entries = [entry for file in files for entry in _entries(file, folder)]
+    finder = FileFinder(folder, _image_folders(folder))
+    entries = [entry for file in files for entry in _entries(file, finder)]
     ids = _ids([entry.name for entry in entries], files[0])
     cameras = _sized(entries)
     depths = FileFinder(folder, suffixes=DEPTH_SUFFIXES, avoid=(".",))
+    clouds = FileFinder(folder, suffixes=(".ply",), avoid=(".",))
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     for id, entry in zip(ids, entries, strict=True):
@@ -78,7 +86,7 @@ def read(path: Path) -> Capture:
             lost[id] = pose
         elif entry.image is None:
             what = f"the image {entry.name[:80]} is missing"
-            error = UserError(what, entry.root.path, "put it where the file says")
+            error = UserError(what, entry.root.path, where_to_put(entry.name))
             lost[id] = Lost("no image", error)
         else:
             camera = cameras[entry.camera]
@@ -96,14 +104,20 @@ def read(path: Path) -> Capture:
                 )
             )
     root = entries[0].root
+    points = _points(root, clouds)
     return Capture(
         path=folder,
         frames=Frames.of(frames, folder),
         lost=lost,
-        doubts=tuple(doubts_of_sizes(cameras.values())),
+        doubts=(
+            *finder.doubts(),
+            *doubts_of_sizes(cameras.values()),
+            *depths.doubts_of_missing("depth"),
+            *clouds.doubts_of_missing("file of points"),
+        ),
         layout=files[0].name,
-        metric=_metric(root, frames),
-        points=_points(root, folder),
+        metric=_metric(root, entries),
+        points=points,
     )
 
 
@@ -119,19 +133,20 @@ def _image_folders(folder: Path) -> list[Path]:
     return [folder / "images", *of_scannetpp]
 
 
-def _entries(file: Path, folder: Path) -> list[_Entry]:
+def _entries(file: Path, finder: FileFinder) -> list[_Entry]:
+    """All frames of a file; ScanNet++ lists those that are kept for tests apart."""
     root = Fields(
         read_json(file, name="transforms", remedy=REMEDY), file, where="it", remedy=REMEDY
     )
     if not root.items("frames"):
         raise root.error("has no frames")
-    finder = FileFinder(folder, _image_folders(folder))
     entries = []
-    for index, values in enumerate(root.items("frames")):
+    for index, values in enumerate([*root.items("frames"), *root.items("test_frames")]):
         frame = Fields(values, file, where=f"frame {index}", remedy=REMEDY)
         name = frame.text("file_path")
         if not name_parts(name):
             raise frame.error("has an empty file_path")
+        frame.where = f"frame {index} ({name[:80]})"
         entries.append(_Entry(frame, root, name, finder.find(name), stated_camera(root, frame)))
     return entries
 
@@ -173,6 +188,8 @@ def _sized(entries: list[_Entry]) -> dict[StatedCamera, SizedCamera]:
 def _pose(entry: _Entry) -> FloatArray | Lost:
     """``(4, 4)`` cam_from_world, or why there is none."""
     frame = entry.frame
+    if "transform_matrix" not in frame:
+        return Lost("no pose", frame.error("has no transform_matrix"))
     rows = frame.values.get("transform_matrix")
     num_rows = 3 if isinstance(rows, list) and len(rows) == 3 else 4
     try:
@@ -197,27 +214,30 @@ def _pose(entry: _Entry) -> FloatArray | Lost:
 def _depth(entry: _Entry, finder: FileFinder) -> tuple[Path | None, float]:
     """The depth of a frame, and its steps in a unit of the world."""
     frame, root = entry.frame, entry.root
-    key, unit = "depth_file_path", "depth_unit_scale_factor"
-    if "depth_path" in frame:  # instant-ngp's words for the same
-        key, unit = "depth_path", "integer_depth_scale"
+    key = next((key for key in reversed(DEPTHS) if key in frame), "depth_file_path")
+    unit = DEPTHS[key]
     factor = root.number(unit, 1 / MILLIMETRES)
     if factor <= 0:
         raise root.error(f"has a {unit} of {factor:g}")
-    return (finder.find(frame.text(key)) if key in frame else None), 1 / factor
+    if key not in frame:
+        return None, 1 / factor
+    return finder.find(frame.text(key), apart_from=entry.image), 1 / factor
 
 
-def _metric(root: Fields, frames: list[Frame]) -> bool:
-    """What the file says of its unit (our word), else whether a sensor measured depth in it."""
+def _metric(root: Fields, entries: list[_Entry]) -> bool:
+    """What the file says of its unit (our word), else whether a sensor measured depth in it.
+
+    Depth that is missing says as much.
+    """
     if "units" in root:
         return is_metric(root)
-    return any(frame.depth_path is not None for frame in frames)
+    return any(key in entry.frame for entry in entries for key in DEPTHS)
 
 
-def _points(root: Fields, folder: Path) -> SparsePoints | None:
+def _points(root: Fields, finder: FileFinder) -> SparsePoints | None:
     """The points of a PLY file in the same world."""
     if "ply_file_path" not in root:
         return None
-    finder = FileFinder(folder, suffixes=(".ply",), avoid=(".",))
     file = finder.find(root.text("ply_file_path"))
     if file is None:
         return None

@@ -56,20 +56,11 @@ def stated_camera(root: Fields, frame: Fields) -> StatedCamera:
     Raises:
         UserError: there is no focal length, a number is none, or the lens is not known.
     """
-    both = Fields(
-        {**_of_camera(root), **_of_camera(frame)},
-        frame.path,
-        where=frame.where,
-        remedy=frame.remedy,
-    )
+    both = Fields.merged((root, frame), INTRINSICS)
     lens = _lens(both)
     focal, of_angles = _focal(frame, both, lens)
     centre = (both.number("cx"), both.number("cy")) if "cx" in both and "cy" in both else None
     return StatedCamera(focal, of_angles, centre, lens, _size(both))
-
-
-def _of_camera(fields: Fields) -> dict[str, object]:
-    return {key: fields.values[key] for key in INTRINSICS if key in fields}
 
 
 def _focal(frame: Fields, both: Fields, lens: Lens | None) -> tuple[tuple[float, float], bool]:
@@ -80,13 +71,16 @@ def _focal(frame: Fields, both: Fields, lens: Lens | None) -> tuple[tuple[float,
         focal = both.number("fl_x")
         both_focal = focal, both.number("fl_y", focal)
         if min(both_focal) <= 0:
-            raise both.error(f"has focal lengths that are not positive ({focal:g})")
+            raise both.error(f"has focal lengths that are not positive ({focal:g})", "fl_x")
         return both_focal, False
     if "camera_angle_x" not in both:
         raise both.error("has no focal length (fl_x or camera_angle_x)")
     angles = both.number("camera_angle_x"), both.number("camera_angle_y", 0.0)
     if not (0 < angles[0] < math.pi and 0 <= angles[1] < math.pi):
-        raise both.error(f"has a camera_angle_x of {angles[0]:g}, not between 0 and pi")
+        key = "camera_angle_x" if not 0 < angles[0] < math.pi else "camera_angle_y"
+        angle = both.number(key)
+        degrees = f" (degrees? say {math.radians(angle):.6g})" if math.pi <= angle < 180 else ""
+        raise both.error(f"has a {key} of {angle:g}, not between 0 and pi{degrees}", key)
     return angles, True
 
 
@@ -101,9 +95,11 @@ def _lens(both: Fields) -> Lens | None:
         return Lens(PANORAMA, ())
     if model not in STRAIGHT:
         known = ", ".join(("OPENCV", "OPENCV_FISHEYE", "PINHOLE", PANORAMA))
-        raise both.error(f"has a camera_model that is not read, {model[:40]} (read are {known})")
+        raise both.error(
+            f"has a camera_model that is not read, {model[:40]} (read are {known})", "camera_model"
+        )
     if k4:
-        raise both.error(f"has a k4 of {k4:g}, which only fisheye lenses have")
+        raise both.error(f"has a k4 of {k4:g}, which only fisheye lenses have", "k4")
     if k3:
         return Lens("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     return Lens("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else None
@@ -114,5 +110,5 @@ def _size(both: Fields) -> tuple[int, int] | None:
         return None
     height, width = both.number("h"), both.number("w")
     if not all(1 <= side < 2**20 and side == int(side) for side in (height, width)):
-        raise both.error(f"has a size of {width:g} x {height:g} pixels")
+        raise both.error(f"has a size of {width:g} x {height:g} pixels", "w")
     return int(height), int(width)

@@ -23,12 +23,19 @@ def is_metric(root: Fields) -> bool:
         UserError: no unit is stated, or one whose length is known and is not a metre.
     """
     if "units" not in root:
-        remedy = 'say "units": "metres", or "unknown" where the scale is not known'
+        unknown = _as_said(root, "unknown")
+        remedy = f"say {_as_said(root, 'metres')}, or {unknown} where the scale is not known"
         raise UserError("the file does not state its units", root.path, remedy)
     units = root.text("units").strip()
     length = OTHERS.get(units.lower().removesuffix("s"))
     if length is not None:
-        remedy = f'multiply translations by {length:g} and say "units": "metres", or say "unknown" '
+        metres, unknown = _as_said(root, "metres"), _as_said(root, "unknown")
+        remedy = f"multiply translations by {length:g} and say {metres}, or say {unknown} "
         remedy += f"and add --scale {length:g}"
         raise UserError(f"its units are {units}, not metres", root.path, remedy)
     return units.lower() in METRES
+
+
+def _as_said(root: Fields, units: str) -> str:
+    """How the file would state a unit."""
+    return f"# units: {units}" if root.path.suffix == ".csv" else f'"units": "{units}"'
