@@ -24,9 +24,8 @@ __all__ = ["triangulated_depths", "wrong_scale"]
 UNITS = {1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
 TOLERANCE = 0.12  # relative
 FAR = 300.0  # metres, where photos are usually not taken
-APART = (
-    5.0  # metres between views, of which deltas depth warns as well: half of how far it searches
-)
+APART = 5.0
+"""Metres between views, of which deltas depth warns as well: half of how far it searches."""
 SCALES = (1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Steps in a metre that depth cameras and data sets write."""
 _SAME_SCALE = 0.04  # relative

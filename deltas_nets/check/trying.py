@@ -18,17 +18,8 @@ ENOUGH = 2.0
 MENDED = 1.3
 """px at that size that a cure may leave: clean captures leave 0.15 to 0.9. What leaves more made
 residuals smaller by accident, however large they were."""
-COMMON = (
-    *(1 / n for n in (1.1, 1.2, 1.25, 1.5, 2, 3, 4)),
-    1.1,
-    1.2,
-    1.25,
-    4 / 3,
-    1.5,
-    2.0,
-    3.0,
-    4.0,
-)
+COMMON = tuple(1 / n for n in (1.1, 1.2, 1.25, 1.5, 2, 3, 4))
+COMMON += (1.1, 1.2, 1.25, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 """Factors that people resize images by."""
 _LEFT = 0.5  # of the residuals, at most, where a hypothesis explains them
 _LEAST_GAIN = 0.3  # px

@@ -78,6 +78,13 @@ def _centre_at(x: float, y: float) -> Plant:
     return intrinsics(change)
 
 
+def moved_down(K: np.ndarray) -> np.ndarray:
+    """A principal point as far from the middle as in cameras that there are: 5 % of the height."""
+    K = K.copy()
+    K[1, 2] *= 0.95
+    return K
+
+
 def in_parts(_: int, frame: Frame) -> Frame:
     """K divided by the sides of its image."""
     height, width = frame.image_size
@@ -131,7 +138,7 @@ CAMERAS: dict[str, tuple[Plant, Fault]] = {
     "K transposed": MATCHES["K transposed"],
     "K of half the size": MATCHES["K of half the size"],
     "K of 3.56 times the size": (
-        intrinsics(lambda K: of_size(K, 1920 / 540)),
+        intrinsics(lambda K: of_size(moved_down(K), 1920 / 540)),
         Fault.K_OF_OTHER_SIZE,
     ),
     "K in parts of the image": (frames(in_parts), Fault.NONSENSE_CALIBRATION),
