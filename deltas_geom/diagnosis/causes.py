@@ -16,6 +16,7 @@ class Cause(Enum):
     OPENGL_WORLD_FROM_CAM = "poses are camera-to-world with OpenGL's axes (y up, z backward)"
     OPENGL_AXES = "poses have OpenGL's axes (y up, z backward)"
     ROTATIONS_TRANSPOSED = "rotations are transposed, translations are not"
+    ROTATIONS_INVERTED = "rotations are inverted, camera centres are not"
     CENTERS_AS_TRANSLATIONS = "translations are the camera centres: t should be -R C"
     K_TRANSPOSED = "K is transposed"
     K_OF_OTHER_SIZE = "K is of images of another size"
@@ -36,6 +37,10 @@ CURES: dict[Cause, str] = {
     Cause.OPENGL_WORLD_FROM_CAM: "PosedViews.from_opengl(K, poses)",
     Cause.OPENGL_AXES: "PosedViews.from_opengl(K, invert_pose(poses))",
     Cause.ROTATIONS_TRANSPOSED: "poses[..., :3, :3] = poses[..., :3, :3].mT.clone()",
+    Cause.ROTATIONS_INVERTED: (
+        "PosedViews.from_world_from_cam(K, poses), poses[..., :3, :3] being as they are and "
+        "poses[..., :3, 3:] the camera centres"
+    ),
     Cause.CENTERS_AS_TRANSLATIONS: (
         "poses[..., :3, 3:] = -poses[..., :3, :3] @ poses[..., :3, 3:]"
     ),

@@ -45,6 +45,11 @@ MENDS: dict[Cause, Mend] = {
     Cause.OPENGL_WORLD_FROM_CAM: lambda K, pose: (K, _FLIP @ invert_pose(pose)),
     Cause.OPENGL_AXES: lambda K, pose: (K, _FLIP @ pose),
     Cause.ROTATIONS_TRANSPOSED: lambda K, pose: (K, _joined(pose[:, :3, :3].mT, pose[:, :3, 3:])),
+    # The centre is -R^T t, and stays: so t becomes R^T R^T t.
+    Cause.ROTATIONS_INVERTED: lambda K, pose: (
+        K,
+        _joined(pose[:, :3, :3].mT, pose[:, :3, :3].mT @ pose[:, :3, :3].mT @ pose[:, :3, 3:]),
+    ),
     Cause.CENTERS_AS_TRANSLATIONS: lambda K, pose: (
         K,
         _joined(pose[:, :3, :3], -pose[:, :3, :3] @ pose[:, :3, 3:]),

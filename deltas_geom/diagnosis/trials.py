@@ -100,8 +100,9 @@ def explains(given: Trial, trial: Trial, threshold: float, *, on: Tensor | None 
     before, after = float(of(given.residual[on])), float(of(trial.residual[on]))
     if before > threshold and after <= min(0.5 * before, threshold):
         return True
-    enough = after <= min(0.25 * before, 2 * threshold) and before - after > 0.5 * threshold
-    return enough or (before > _EXACT and after <= 0.1 * before)
+    # However large residuals were, what is left must be what cameras leave that fit.
+    enough = after <= min(0.25 * before, threshold) and before - after > 0.5 * threshold
+    return enough or (before > _EXACT and after <= min(0.1 * before, threshold))
 
 
 def level(residual: Tensor) -> float:

@@ -22,6 +22,8 @@ __all__ = ["other_axes"]
 MIRROR = np.diag([1.0, 1, -1, 1])
 """A world of a left hand, made one of a right hand."""
 WAYS = (("right", "left"), ("down", "up"), ("forward", "backward"))
+_LEFT = 0.25
+"""Of the residuals, at most: of so many ways one takes half of them by accident."""
 ORDINALS = ("first", "second", "third")
 
 
@@ -86,8 +88,9 @@ def other_axes(
     best: Suspect | None = None
     for axes in _all_axes():
         found = tried(evidence, given, PosedViews(views.K, torch.from_numpy(axes.mended(poses))))
+        explains = found.explains and found.after <= _LEFT * found.given
         # Cameras that hardly turn fit several: the first is the simplest.
-        if found.explains and (best is None or found.after < 0.8 * best.tried.after):
+        if explains and (best is None or found.after < 0.8 * best.tried.after):
             cause = Fault.OTHER_AXES
             what = f"axes as {axes.in_words} fit: {found.in_words}"
             mend = changing_poses(axes.mended)

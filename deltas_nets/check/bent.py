@@ -19,7 +19,7 @@ from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.frames_apart import MOSTLY
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import changing_frames
-from deltas_nets.check.trying import ENOUGH, Suspect, Tried
+from deltas_nets.check.trying import ENOUGH, MENDED, Suspect, Tried
 
 __all__ = ["LENSES", "wrong_lenses_of_matches"]
 
@@ -143,6 +143,8 @@ def _suspect(
     )
     least = min(_LEFT * mostly.given, ENOUGH)
     if mostly.given - mostly.after < _LEAST_GAIN or mostly.after > least:
+        return None
+    if quarter.after > MENDED:
         return None
 
     def change(_: int, frame: Frame) -> Frame:

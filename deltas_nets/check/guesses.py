@@ -7,6 +7,8 @@ from deltas_nets.check.intrinsics import in_a_line
 __all__ = ["improved_guess"]
 
 _OF_K = (Fault.FOCAL_LENGTH, Fault.K_OF_OTHER_SIZE, Fault.K_OF_SOME_FRAMES)
+_UNCONFIRMED = (Fault.UNEXPLAINED, Fault.FEW_MATCHES)
+"""What leaves a guess a guess: --mend would write it as if it were known."""
 
 
 def improved_guess(
@@ -15,10 +17,12 @@ def improved_guess(
     """A finding of nonsense, with the cure that matches tell, and the others that are left.
 
     Args:
-        guess: whose mend is a guess.
+        guess: whose mend is a guess; without it where matches do not confirm it.
         found: what matches say of the capture with that mend.
         guessed: that capture.
     """
+    if any(one.cause in _UNCONFIRMED for one in found):
+        return guess._replace(mend=None), found
     of_K = next((one for one in found if one.cause in _OF_K), None)
     rest = [one for one in found if one is not of_K]
     if of_K is None or of_K.mend is None or guess.mend is None:

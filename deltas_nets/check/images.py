@@ -55,10 +55,11 @@ def look_at_images(capture: Capture) -> list[Finding]:
         first = next(iter(broken))
         total = len(seen) + len(broken)
         what = f"{len(broken)} of {total} images cannot be used ({first}: {broken[first]})"
-        cure = "copy them again, convert them to 8-bit JPEG, or leave out "
-        cure += ids_in_words(broken, 20)
-        mend = leaving_out(tuple(broken))
-        found = [Finding(Fault.IMAGES_UNREADABLE, what, tuple(broken), cure, "error", mend)]
+        cure, ids = "copy them again, or convert them to 8-bit JPEG", tuple(broken)
+        found = [Finding(Fault.IMAGES_UNREADABLE, what, (), cure, "error")]
+        if seen:
+            cure += f", or leave out {ids_in_words(broken, 20)}"
+            found = [Finding(Fault.IMAGES_UNREADABLE, what, ids, cure, "error", leaving_out(ids))]
     return [*found, *_blurred(capture, seen), *_same(capture, seen)]
 
 

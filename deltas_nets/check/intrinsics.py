@@ -12,14 +12,16 @@ from deltas_nets.check.mending import changing_frames
 from deltas_nets.check.rewrite import of_size, swapped, with_K
 from deltas_nets.check.trying import common
 
-__all__ = ["Suspicion", "in_a_line", "suspicion_of", "wrong_intrinsics"]
+__all__ = ["Suspicion", "in_a_line", "off_middle", "suspicion_of", "wrong_intrinsics"]
 
 FOCAL = (0.15, 20.0)
 """Of the longer side: an angle of view of 147 degrees, and one of 3."""
 USUAL_FOCAL = 0.85
 SHAPES = (0.6, 1.7)  # fy / fx
 CENTRAL = 0.08  # parts of the image that a principal point is off the middle, if nobody cropped
-AGREEING = 0.04  # parts within which both axes tell of the same size
+AGREEING = 0.1  # relative, within which both axes tell of the same size
+PARTS = (0.25, 0.75)  # of a side: where a principal point is, if it is written so
+SQUARE = (0.9, 1.1)  # fy / fx of nearly all cameras
 
 
 class Suspicion(NamedTuple):
@@ -67,7 +69,6 @@ def _rights(camera_of: np.ndarray, right: dict[int, FloatArray]) -> list[FloatAr
 
 def suspicion_of(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
     """What is wrong with a K for images ``(height, width)``, as far as that shows in numbers."""
-    height, width = image_size
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         focal = f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px"
         guess = usual_K(K, image_size)
@@ -76,16 +77,62 @@ def suspicion_of(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None
     if abs(K[2, :2]).max() > 1 and abs(K[:2, 2]).max() < 1:
         evidence = f"the principal point ({K[2, 0]:g}, {K[2, 1]:g}) is in the last row"
         return Suspicion(Fault.K_TRANSPOSED, evidence, f"write K as {in_a_line(K.T)}", K.T.copy())
+    return (
+        _in_parts(K, image_size)
+        or _of_no_lens(K, image_size)
+        or _in_the_corner(K, image_size)
+        or _of_other_images(K, image_size)
+    )
+
+
+def off_middle(K: FloatArray, image_size: tuple[int, int]) -> float:
+    """How far the principal point is from the middle of the image, in parts of its sides."""
+    height, width = image_size
+    x, y = (K[0, 2] + 0.5) / width - 0.5, (K[1, 2] + 0.5) / height - 0.5
+    return float(max(abs(x), abs(y)))
+
+
+def _in_parts(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
+    """K divided by the sides of the image, as some programs write it."""
+    height, width = image_size
+    right = np.diag([width, height, 1.0]) @ K
+    inside = PARTS[0] <= min(K[:2, 2]) and max(K[:2, 2]) <= PARTS[1]
+    square = SQUARE[0] <= right[1, 1] / right[0, 0] <= SQUARE[1]
+    if not inside or not square or _of_no_lens(right, image_size) is not None:
+        return None
+    evidence = f"{in_a_line(K)} are parts of the sides of images of {width}x{height}"
+    cure = f"multiply fx and cx by the width, fy and cy by the height: {in_a_line(right)}"
+    return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, right)
+
+
+def _of_no_lens(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
+    """Focal lengths too short, too long or too different."""
+    height, width = image_size
     relative, shape = max(K[0, 0], K[1, 1]) / max(image_size), K[1, 1] / K[0, 0]
-    if not FOCAL[0] <= relative <= FOCAL[1] or not SHAPES[0] <= shape <= SHAPES[1]:
-        evidence = (
-            f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px for images of {width}x{height}, "
-            f"{relative:.2g} times their longer side"
-        )
-        guess = usual_K(K, image_size)
-        cure = f"calibrate the camera; many have about {in_a_line(guess)} for such images"
-        return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, guess)
-    return _of_other_images(K, image_size)
+    if FOCAL[0] <= relative <= FOCAL[1] and SHAPES[0] <= shape <= SHAPES[1]:
+        return None
+    evidence = (
+        f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px for images of {width}x{height}, "
+        f"{relative:.2g} times their longer side"
+    )
+    guess = usual_K(K, image_size)
+    cure = f"calibrate the camera; many have about {in_a_line(guess)} for such images"
+    return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, guess)
+
+
+def _in_the_corner(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
+    """A principal point that nobody stated, or that is in parts of the sides."""
+    height, width = image_size
+    if max(abs(K[:2, 2])) > 1:
+        return None
+    guess = K.copy()
+    guess[:2, 2] = (width - 1) / 2, (height - 1) / 2
+    evidence = (
+        f"the principal point ({K[0, 2]:.3g}, {K[1, 2]:.3g}) is the corner of images of "
+        f"{width}x{height}: cx and cy are 0, or parts of the sides"
+    )
+    cure = f"calibrate the camera; the middle is cx {guess[0, 2]:g} cy {guess[1, 2]:g}"
+    return Suspicion(Fault.NONSENSE_CALIBRATION, evidence, cure, guess)
 
 
 def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | None:
@@ -99,8 +146,9 @@ def _of_other_images(K: FloatArray, image_size: tuple[int, int]) -> Suspicion | 
     if right * down < 0 and max(off) < CENTRAL:
         evidence = f"{point} is in the middle of images of {height}x{width}"
         return Suspicion(Fault.SIDES_SWAPPED, evidence, f"write K as {in_a_line(other)}", other)
-    factor = 0.5 / (0.5 + (right + down) / 2)
-    if abs(right - down) < AGREEING and factor > 0:
+    ahead = min(right, down) > -0.5
+    if ahead and abs(np.log((0.5 + right) / (0.5 + down))) < AGREEING:
+        factor = 0.5 / (0.5 + (right + down) / 2)
         evidence = f"{point} is in the middle of images {1 / factor:.3g} times as large"
         # A principal point is in the middle within a few parts of a hundred.
         factor = common(factor, within=0.04)

@@ -19,6 +19,7 @@ from deltas_nets.check.frames_apart import MOSTLY, views_apart
 from deltas_nets.check.kinds_of_cameras import wrong_kinds
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import leaving_out
+from deltas_nets.check.quaternions import other_quaternions
 from deltas_nets.check.scale import wrong_scale
 from deltas_nets.check.sensor import sensors
 from deltas_nets.check.time_shift import poses_of_other_frames
@@ -108,10 +109,11 @@ def _explained(
     suspects = [
         suspect
         for suspect in (
-            of_all_cameras(diagnosis),
+            *of_all_cameras(capture, matched, evidence, given),
             poses_of_other_frames(capture, matched, evidence),
             *wrong_kinds(capture, matched, evidence),
             *wrong_lenses_of_matches(capture, matched, evidence),
+            *other_quaternions(capture, matched, evidence, given),
         )
         if suspect is not None
     ]

@@ -16,7 +16,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.finding import Fault, Finding
-from deltas_nets.check.intrinsics import in_a_line
+from deltas_nets.check.intrinsics import in_a_line, off_middle
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import changing_frames
 from deltas_nets.check.rewrite import of_size, swapped, with_focal, with_K
@@ -67,6 +67,7 @@ def wrong_kinds(capture: Capture, matched: Matched, evidence: Evidence) -> Itera
         groups += [kinds == kind for kind in kinds_by_size]
     for group in groups:
         members = torch.from_numpy(group[list(matched.positions)])[:, None, None]
+        suspects = dict[float, Suspect]()
         for way in WAYS if members.any() else ():
 
             def changed(factor: float, way: _Way = way, members: Tensor = members) -> PosedViews:
@@ -79,7 +80,15 @@ def wrong_kinds(capture: Capture, matched: Matched, evidence: Evidence) -> Itera
             factor = rounded(searched(cost), cost)
             found = tried(evidence, given, changed(factor))
             if found.explains and abs(np.log(factor)) > LEAST_CHANGE:
-                yield Suspect(found, _finding(frames, group, way, factor, found.in_words))
+                index = int(np.flatnonzero(group)[0])
+                middle = off_middle(
+                    way.of_frame(frames.K[index], factor), frames.at(index).image_size
+                )
+                suspects[middle] = Suspect(
+                    found, _finding(frames, group, way, factor, found.in_words)
+                )
+        # Of two that fit alike, the one that leaves the principal point nearer to the middle.
+        yield from (suspects[middle] for middle in sorted(suspects))
     yield from _swapped(frames, matched, evidence, given)
 
 

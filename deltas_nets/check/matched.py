@@ -34,12 +34,14 @@ class Matched(NamedTuple):
         pixels: ``(V, N, 2)`` float64, px of the sizes; NaN where a frame does not see the point.
         sizes: (height, width) at which each frame was looked at.
         unread: why images could not be read, by position.
+        alone: positions of frames that match nothing, though the frames around them match.
     """
 
     positions: tuple[int, ...]
     pixels: Tensor
     sizes: tuple[tuple[int, int], ...]
     unread: dict[int, UserError]
+    alone: tuple[int, ...] = ()
 
     @property
     def seen(self) -> Tensor:
@@ -112,6 +114,13 @@ class _Looked:
             self.known[position] = described
         return self.known[position]
 
+    def match(self, one: int, other: int) -> bool:
+        """Whether two frames match."""
+        first, second = self(one), self(other)
+        if first is None or second is None:
+            return False
+        return int(match(first, second)[1].sum()) >= LEAST
+
 
 def _spread(count: int, groups: int) -> list[int]:
     """Positions in the middle of ``groups`` equal parts."""
@@ -170,4 +179,20 @@ def _joined(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> Matched:
         blocks.append(block[:, block.isfinite().all(dim=-1).sum(dim=0) > 1])
     pixels = torch.cat(blocks, dim=1) if blocks else torch.zeros(0, 0, 2).double()
     sizes = tuple(described.size for p in positions if (described := looked.known[p]) is not None)
-    return Matched(tuple(positions), pixels, sizes, looked.unread)
+    return Matched(tuple(positions), pixels, sizes, looked.unread, _alone(looked, groups))
+
+
+def _alone(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> tuple[int, ...]:
+    """Frames between two of a group, one before and one after, neither of which they match."""
+    matched = {position for group in groups for position in group}
+    described = [position for position, seen in looked.known.items() if seen is not None]
+    alone = []
+    for position in sorted(set(described) - matched):
+        for group in groups:
+            before = max((other for other in group if other < position), default=None)
+            after = min((other for other in group if other > position), default=None)
+            if before is not None and after is not None:
+                if not any(looked.match(position, other) for other in (before, after)):
+                    alone.append(position)
+                break
+    return tuple(alone)

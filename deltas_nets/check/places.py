@@ -6,7 +6,8 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.finding import Fault, Finding
-from deltas_nets.check.mending import leaving_out, scaling_poses
+from deltas_nets.check.mending import leaving_out
+from deltas_nets.check.units import hardly_metres
 
 __all__ = ["centres_of", "wrong_places"]
 
@@ -62,6 +63,4 @@ def _unit(capture: Capture, centres: FloatArray) -> list[Finding]:
     step = float(np.median(np.linalg.norm(np.diff(centres, axis=0), axis=-1)))
     if not capture.metric or step <= STEPS[1]:
         return []
-    evidence = f"from a frame to the next the camera moves by {step:.3g} m (median)"
-    cure = "if poses are in millimetres, multiply their translations by 0.001"
-    return [Finding(Fault.NOT_METRES, evidence, (), cure, "error", scaling_poses(1e-3))]
+    return [hardly_metres("from a frame to the next the camera moves by", step)]

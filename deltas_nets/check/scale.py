@@ -1,26 +1,34 @@
 """The unit of poses, by what matches triangulate to and a sensor measured."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from deltas_geom import PosedViews, triangulate
+from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.diagnosis.evidence import Evidence
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.matched import Matched
-from deltas_nets.check.mending import scaling_poses
+from deltas_nets.check.mending import changing_frames, scaling_poses
 from deltas_nets.check.sensor import Sensor
 from deltas_nets.check.trying import ENOUGH
+from deltas_nets.check.units import hardly_metres
 
 __all__ = ["triangulated_depths", "wrong_scale"]
 
 UNITS = {1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
 TOLERANCE = 0.12  # relative
 FAR = 300.0  # metres, where photos are usually not taken
+APART = 5.0
+"""Metres between views, of which deltas depth warns as well: half of how far it searches."""
+SCALES = (1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
+"""Steps in a metre that depth cameras and data sets write."""
+_SAME_SCALE = 0.04  # relative
 _PARALLAX = np.radians(1.0)
 _LEAST = 60  # points
 
@@ -46,10 +54,26 @@ def wrong_scale(
         factor = 1 / float(np.median(ratios))
         if abs(np.log(factor)) <= TOLERANCE:
             return []
-        return [_of_sensor(capture, factor, len(ratios))]
+        steps = _steps_meant(capture, known, factor)
+        if steps is not None:
+            return [_of_steps(steps, factor, len(ratios))]
+        return [_of_sensor(factor, len(ratios))]
+    return (
+        _without_sensor(matched.views(capture.frames), evidence, depths) if capture.metric else []
+    )
+
+
+def _without_sensor(views: PosedViews, evidence: Evidence, depths: Tensor) -> list[Finding]:
+    """A finding where things or cameras are too far away for metres."""
     usual = float(depths.nanmedian())
-    if capture.metric and usual > FAR:
-        return [_of_distance(usual)]
+    if usual > FAR:
+        return [hardly_metres("what matches triangulate to is away by", usual)]
+    centres = camera_centers(views.cam_from_world)
+    first, second = evidence.pairs.unbind(dim=-1)
+    apart = float((centres[first] - centres[second]).norm(dim=-1).median())
+    if apart > APART:
+        words = "frames that see the same stand apart by"
+        return [hardly_metres(words, apart, severity="warning")]
     return []
 
 
@@ -82,7 +106,34 @@ def _read(sensor: Sensor, pixels: FloatArray, size: tuple[int, int]) -> FloatArr
     return np.where(inside, depth, 0.0).astype(np.float64)
 
 
-def _of_sensor(capture: Capture, factor: float, points: int) -> Finding:
+def _steps_meant(
+    capture: Capture, known: Mapping[int, Sensor], factor: float
+) -> tuple[float, float] | None:
+    """Steps in a metre as stated, and those with which poses in metres fit; None if none do."""
+    stated = {capture.frames.at(position).depth_scale for position in known}
+    if not capture.metric or len(stated) != 1:
+        return None
+    (scale,) = stated
+    meant = scale * factor
+    near = next((s for s in SCALES if abs(np.log(s / meant)) < _SAME_SCALE), None)
+    return None if near is None else (scale, near)
+
+
+def _of_steps(steps: tuple[float, float], factor: float, points: int) -> Finding:
+    stated, meant = steps
+    evidence = (
+        f"what matches triangulate to is {1 / factor:.4g} times as far as the sensor measured "
+        f"(median of {points} points): depth is in 1/{meant:g} m, not in 1/{stated:g} m"
+    )
+
+    def change(_: int, frame: Frame) -> Frame:
+        return replace(frame, depth_scale=meant)
+
+    cure = f"state a depth_scale of {meant:g}"
+    return Finding(Fault.DEPTH_SCALE, evidence, (), cure, "error", changing_frames(change))
+
+
+def _of_sensor(factor: float, points: int) -> Finding:
     unit = next((u for u in UNITS if abs(np.log(factor / u)) < TOLERANCE), None)
     evidence = (
         f"what matches triangulate to is {1 / factor:.4g} times as far as the sensor measured "
@@ -96,9 +147,3 @@ def _of_sensor(capture: Capture, factor: float, points: int) -> Finding:
         cure += f"; or, if poses are right, depth by {1 / factor:.4g}"
     cause = Fault.NOT_METRES if unit is not None else Fault.WRONG_SCALE
     return Finding(cause, evidence, (), cure, "error", scaling_poses(factor))
-
-
-def _of_distance(usual: float) -> Finding:
-    evidence = f"what matches triangulate to is {usual:.3g} m away (median)"
-    cure = "if poses are in millimetres, multiply their translations by 0.001"
-    return Finding(Fault.NOT_METRES, evidence, (), cure, "error", scaling_poses(1e-3))

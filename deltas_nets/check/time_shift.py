@@ -11,13 +11,14 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.check.finding import Fault, Finding, Mend
 from deltas_nets.check.matched import Matched
-from deltas_nets.check.trying import Suspect, Tried
+from deltas_nets.check.trying import ENOUGH, Suspect, Tried
 
 __all__ = ["poses_of_other_frames"]
 
 MOST = 10
 """Frames that poses may be early or late."""
 _LEAST = 0.15  # of the pairs must have both poses, for a shift to count
+_NEARLY_ALL = 0.7  # of those pairs must fit: a shift is of all frames, or of none
 
 
 def poses_of_other_frames(capture: Capture, matched: Matched, evidence: Evidence) -> Suspect | None:
@@ -26,7 +27,9 @@ def poses_of_other_frames(capture: Capture, matched: Matched, evidence: Evidence
     views = matched.views(frames)
     given = residuals(evidence, *views)
     best: tuple[Tried, int] | None = None
-    for shift in (shift for size in range(1, MOST + 1) for shift in (-size, size)):
+    # A shift that leaves half of the frames without a pose would be judged by the other half.
+    most = min(MOST, (len(frames) - 1) // 2)
+    for shift in (shift for size in range(1, most + 1) for shift in (-size, size)):
         there = positions + shift
         inside = torch.from_numpy((there >= 0) & (there < len(frames)))
         both = inside[evidence.pairs].all(dim=-1)
@@ -35,7 +38,8 @@ def poses_of_other_frames(capture: Capture, matched: Matched, evidence: Evidence
         poses = torch.from_numpy(frames.cam_from_world[there.clip(0, len(frames) - 1)])
         after = residuals(evidence.of(both), views.K, poses)
         found = Tried(level(given[both]), level(after))
-        if found.explains and (best is None or found.after < best[0].after):
+        fits = float((after <= ENOUGH).double().mean()) >= _NEARLY_ALL
+        if fits and found.explains and (best is None or found.after < best[0].after):
             best = found, shift
     if best is None:
         return None

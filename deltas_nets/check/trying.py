@@ -11,14 +11,19 @@ from deltas_geom.diagnosis.evidence import Evidence, residuals
 from deltas_geom.diagnosis.trials import level
 from deltas_nets.check.finding import Finding
 
-__all__ = ["ENOUGH", "Suspect", "Tried", "common", "rounded", "searched", "tried"]
+__all__ = ["ENOUGH", "MENDED", "Suspect", "Tried", "common", "rounded", "searched", "tried"]
 
 ENOUGH = 2.0
 """px at the size that frames are looked at (about 400 wide): cameras that fit are below."""
-COMMON = (*(1 / n for n in (1.1, 1.2, 1.25, 1.5, 2, 3, 4)), 1.1, 1.2, 1.25, 4 / 3, 1.5, 2.0, 3.0)
+MENDED = 1.3
+"""px at that size that a cure may leave: clean captures leave 0.15 to 0.9. What leaves more made
+residuals smaller by accident, however large they were."""
+COMMON = tuple(1 / n for n in (1.1, 1.2, 1.25, 1.5, 2, 3, 4))
+COMMON += (1.1, 1.2, 1.25, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 """Factors that people resize images by."""
 _LEFT = 0.5  # of the residuals, at most, where a hypothesis explains them
 _LEAST_GAIN = 0.3  # px
+_NEXT = 0.03  # relative, of a factor next to another
 
 
 class Tried(NamedTuple):
@@ -36,7 +41,7 @@ class Tried(NamedTuple):
     def explains(self) -> bool:
         """Whether so little is left that it is no accident."""
         gain = self.given - self.after
-        return gain > _LEAST_GAIN and self.after <= min(_LEFT * self.given, 2 * ENOUGH)
+        return gain > _LEAST_GAIN and self.after <= min(_LEFT * self.given, MENDED)
 
     @property
     def in_words(self) -> str:
@@ -61,9 +66,9 @@ def tried(evidence: Evidence, given: Tensor, views: PosedViews) -> Tried:
     return Tried(level(given), level(residuals(evidence, *views)))
 
 
-def searched(cost: Callable[[float], float], low: float = 0.4, high: float = 2.6) -> float:
+def searched(cost: Callable[[float], float], low: float = 0.2, high: float = 5.0) -> float:
     """The factor of least cost, to 0.05 %; a grid first, as costs have many valleys."""
-    grid = np.exp(np.linspace(np.log(low), np.log(high), 31))
+    grid = np.exp(np.linspace(np.log(low), np.log(high), 53))
     costs = [cost(float(factor)) for factor in grid]
     best = int(np.argmin(costs))
     center, width, least = float(grid[best]), float(np.log(grid[1] / grid[0])), costs[best]
@@ -78,8 +83,10 @@ def searched(cost: Callable[[float], float], low: float = 0.4, high: float = 2.6
 
 def rounded(factor: float, cost: Callable[[float], float]) -> float:
     """A factor that people resize by, where that is next to the best and about as good."""
-    near = common(factor, within=0.02)
-    return near if cost(near) <= 1.15 * cost(factor) + 0.05 else factor
+    # Of factors that are a few parts of a hundred apart, as 0.8 and 0.83, residuals know which.
+    near = [common for common in COMMON if abs(np.log(common / factor)) < _NEXT]
+    best = min(near, key=cost, default=factor)
+    return best if cost(best) <= 1.15 * cost(factor) + 0.05 else factor
 
 
 def common(factor: float, *, within: float) -> float:

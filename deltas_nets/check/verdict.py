@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
+from deltas_nets.check.depth_files import unreadable_depth
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.guesses import improved_guess
 from deltas_nets.check.image_sizes import wrong_sizes
@@ -15,6 +16,7 @@ from deltas_nets.check.matched import match_capture
 from deltas_nets.check.mending import leaving_out
 from deltas_nets.check.quick import quick_findings
 from deltas_nets.check.scan import scan_frames
+from deltas_nets.check.unmatched import unmatched_frames
 from deltas_nets.network.deltas import Deltas
 
 __all__ = ["Checked", "check_capture"]
@@ -90,8 +92,8 @@ def check_capture(
     sizes = wrong_sizes(capture)
     readable = sizes[0].mend(capture) if sizes and sizes[0].mend is not None else capture
     certain = [*known, *sizes]
-    found = [*quick_findings(readable), *look_at_images(readable)]
-    if any(finding.cause is Fault.NO_BASELINE for finding in found):
+    found = [*quick_findings(readable), *look_at_images(readable), *unreadable_depth(readable)]
+    if any(_leaves_nothing(finding) for finding in found):
         figures = Figures(len(capture.frames), 0, 0, 0, float("nan"), 0.0, 0.0)
         return _checked([*certain, *found], figures, start)
     guesses = [finding for finding in found if finding.cause in GUESSED]
@@ -99,6 +101,7 @@ def check_capture(
         readable = readable if guess.mend is None else guess.mend(readable)
     matched = match_capture(readable, network, threads=threads, report=report)
     more, figures = judge_matches(readable, matched)
+    found += unmatched_frames(readable, matched)
     if figures.pairs:
         told = {*OVERRULED, *(one.cause for one in more)}
         if Fault.POSES_OF_OTHER_FRAMES in told:
@@ -114,6 +117,12 @@ def check_capture(
         improved, more = improved_guess(guess, more, readable)
         told_before = [improved if one is guess else one for one in told_before]
     return _checked([*told_before, *more], figures, start)
+
+
+def _leaves_nothing(finding: Finding) -> bool:
+    """Whether matches cannot tell more: cameras stand still, or no image can be read."""
+    no_image = finding.cause is Fault.IMAGES_UNREADABLE and not finding.frames
+    return no_image or finding.cause is Fault.NO_BASELINE
 
 
 def _checked(findings: list[Finding], figures: Figures, start: float) -> Checked:

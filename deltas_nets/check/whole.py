@@ -1,11 +1,14 @@
-"""What `diagnose` says of all cameras of a capture, as a finding."""
+"""Causes of all cameras of a capture that `diagnose` knows, as findings."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from deltas_geom import diagnose
 from deltas_geom.diagnosis.causes import Cause
+from deltas_geom.diagnosis.evidence import Evidence
 from deltas_geom.diagnosis.hypotheses import MENDS
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_nets.captures.capture import Capture
@@ -14,7 +17,7 @@ from deltas_nets.check.finding import Fault, Finding, Mend
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import changing_frames, changing_poses
 from deltas_nets.check.rewrite import with_K
-from deltas_nets.check.trying import ENOUGH, Suspect, Tried
+from deltas_nets.check.trying import ENOUGH, Suspect, tried
 
 __all__ = ["diagnosed", "of_all_cameras"]
 
@@ -46,6 +49,10 @@ KNOWN = {
     Cause.ROTATIONS_TRANSPOSED: _Known(
         Fault.ROTATIONS_TRANSPOSED, "transpose the rotation of each pose"
     ),
+    Cause.ROTATIONS_INVERTED: _Known(
+        Fault.ROTATIONS_INVERTED,
+        "transpose the rotation of each camera-to-world matrix; camera centres stay as they are",
+    ),
     Cause.CENTERS_AS_TRANSLATIONS: _Known(
         Fault.CENTERS_AS_TRANSLATIONS, "write t = -R C, C being what stands there now"
     ),
@@ -61,14 +68,23 @@ def diagnosed(capture: Capture, matched: Matched) -> Diagnosis:
     )
 
 
-def of_all_cameras(diagnosis: Diagnosis) -> Suspect | None:
-    """The suspect that a diagnosis names, where that concerns all cameras."""
-    known = KNOWN.get(diagnosis.cause)
-    if known is None or diagnosis.cameras:
-        return None
-    found = Tried(diagnosis.residual_as_given, diagnosis.residual_if_mended)
-    finding = Finding(known.fault, found.in_words, (), known.cure, "error", _mend(diagnosis.cause))
-    return Suspect(found, finding)
+def of_all_cameras(
+    capture: Capture, matched: Matched, evidence: Evidence, given: Tensor
+) -> Iterator[Suspect]:
+    """Causes of all cameras that explain residuals, each judged by what its mend makes of files.
+
+    Args:
+        capture: as it was read.
+        matched: its matches.
+        evidence: the same, of pairs.
+        given: ``(P)`` px, residuals as the capture has it.
+    """
+    for cause, known in KNOWN.items():
+        mend = _mend(cause)
+        found = tried(evidence, given, matched.views(mend(capture).frames))
+        if found.explains:
+            finding = Finding(known.fault, found.in_words, (), known.cure, "error", mend)
+            yield Suspect(found, finding)
 
 
 def _mend(cause: Cause) -> Mend:

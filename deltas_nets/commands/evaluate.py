@@ -1,5 +1,6 @@
 """The command `deltas evaluate`."""
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -233,6 +234,11 @@ class Evaluate(Prediction):
             console.print(report.scenes_table(scores, title="scenes, means over frames"))
         title = f"{title}: {len(total.frames)} frames"
         console.print(report.metrics_table(report.scores_by_name(total), title=title))
+        if total.sparse is not None and math.isnan(total.sparse.abs_rel):
+            print(
+                "no triangulated point lies where depth is measured: are poses and depth in the "
+                "same unit? deltas check tells"
+            )
         if total.calibration is not None:
             heading = "relative errors of dense depth"
             console.print(report.calibration_table(total.calibration, title=heading))

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["DepthMetrics", "DepthSums", "depth_metrics", "depth_sums", "mean_metrics"]
 
@@ -154,9 +154,17 @@ def depth_metrics(
 def mean_metrics(metrics: list[DepthMetrics]) -> DepthMetrics:
     """Mean over depth maps, as the paper and the field report it.
 
+    Maps without a prediction count in the coverage alone; where no map has one, the other means
+    are NaN.
+
     Raises:
         ValueError: the list is empty.
     """
     if not metrics:
         raise ValueError("no depth map has true depth in range")
-    return DepthMetrics(*(float(value) for value in np.nanmean(np.array(metrics), axis=0)))
+    return DepthMetrics(*(_mean_of_known(values) for values in np.array(metrics).T))
+
+
+def _mean_of_known(values: NDArray[np.float64]) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else float("nan")

@@ -112,6 +112,7 @@ GLOBAL: dict[Cause, Fault] = {
     Cause.OPENGL_WORLD_FROM_CAM: lambda K, T, x: (K, invert_pose(T) @ FLIP, x),
     Cause.OPENGL_AXES: lambda K, T, x: (K, FLIP @ T, x),
     Cause.ROTATIONS_TRANSPOSED: lambda K, T, x: (K, transposed(T), x),
+    Cause.ROTATIONS_INVERTED: lambda K, T, x: (K, invert_pose(transposed(invert_pose(T))), x),
     Cause.CENTERS_AS_TRANSLATIONS: lambda K, T, x: (
         K,
         with_translation(T, invert_pose(T)[:, :3, 3]),

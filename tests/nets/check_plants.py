@@ -10,6 +10,7 @@ from PIL import Image
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.rotations import quaternions_of, rotations_of
 from deltas_nets.check.finding import Fault
 from deltas_nets.check.rewrite import of_shape, of_size, swapped, with_focal
 
@@ -54,6 +55,42 @@ def _moved(pose: np.ndarray) -> np.ndarray:
     return pose
 
 
+def _rotations_inverted(pose: np.ndarray) -> np.ndarray:
+    """Centres stay where they are."""
+    world_from_cam = np.linalg.inv(pose)
+    world_from_cam[:, :3, :3] = world_from_cam[:, :3, :3].transpose(0, 2, 1)
+    return np.linalg.inv(world_from_cam)
+
+
+def w_last(pose: np.ndarray) -> np.ndarray:
+    """Quaternions written x, y, z, w and read w, x, y, z, as a hand-made images.txt has them."""
+    quaternions = quaternions_of(pose[:, :3, :3])
+    pose[:, :3, :3] = rotations_of(np.roll(quaternions, -1, axis=-1))
+    return pose
+
+
+def _centre_at(x: float, y: float) -> Plant:
+    def change(K: np.ndarray) -> np.ndarray:
+        K = K.copy()
+        K[:2, 2] = x, y
+        return K
+
+    return intrinsics(change)
+
+
+def moved_down(K: np.ndarray) -> np.ndarray:
+    """A principal point as far from the middle as in cameras that there are: 5 % of the height."""
+    K = K.copy()
+    K[1, 2] *= 0.95
+    return K
+
+
+def in_parts(_: int, frame: Frame) -> Frame:
+    """K divided by the sides of its image."""
+    height, width = frame.image_size
+    return replace(frame, K=np.diag([1 / width, 1 / height, 1]) @ frame.K)
+
+
 def _still(pose: np.ndarray) -> np.ndarray:
     centre = -pose[0, :3, :3].T @ pose[0, :3, 3]
     pose[:, :3, 3] = -pose[:, :3, :3] @ centre
@@ -85,6 +122,13 @@ MATCHES: dict[str, tuple[Plant, Fault]] = {
     "x and y swapped": (intrinsics(swapped), Fault.SIDES_SWAPPED),
     "one K in three": (intrinsics(lambda K: of_size(K, 1.1), every=3), Fault.K_OF_SOME_FRAMES),
     "five frames late": (poses(lambda pose: np.roll(pose, 5, 0)), Fault.POSES_OF_OTHER_FRAMES),
+    "rotations inverted": (poses(_rotations_inverted), Fault.ROTATIONS_INVERTED),
+    "quaternions w last": (poses(w_last), Fault.QUATERNION_ORDER),
+    "K of a quarter the size": (intrinsics(lambda K: of_size(K, 0.25)), Fault.K_OF_OTHER_SIZE),
+    "depth of 1/5000 m": (
+        frames(lambda _, frame: replace(frame, depth_scale=frame.depth_scale / 5)),
+        Fault.DEPTH_SCALE,
+    ),
     "one pose in ten": (poses(_moved), Fault.FRAMES_DISAGREE),
 }
 """Faults that matches tell."""
@@ -93,6 +137,18 @@ CAMERAS: dict[str, tuple[Plant, Fault]] = {
     "millimetres": MATCHES["millimetres"],
     "K transposed": MATCHES["K transposed"],
     "K of half the size": MATCHES["K of half the size"],
+    "K of 3.56 times the size": (
+        intrinsics(lambda K: of_size(moved_down(K), 1920 / 540)),
+        Fault.K_OF_OTHER_SIZE,
+    ),
+    "K in parts of the image": (frames(in_parts), Fault.NONSENSE_CALIBRATION),
+    "centre at 0": (_centre_at(0, 0), Fault.NONSENSE_CALIBRATION),
+    "centre at -0.5": (_centre_at(-0.5, -0.5), Fault.NONSENSE_CALIBRATION),
+    "centre in parts of the image": (_centre_at(0.5, 0.47), Fault.NONSENSE_CALIBRATION),
+    "focal length in mm": (
+        intrinsics(lambda K: with_focal(K, 4.2 / K[0, 0])),
+        Fault.NONSENSE_CALIBRATION,
+    ),
     "standing still": (poses(_still), Fault.NO_BASELINE),
     "36 times the width": (intrinsics(_long), Fault.NONSENSE_CALIBRATION),
     "k1 of 1.5": (

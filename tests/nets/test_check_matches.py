@@ -21,7 +21,14 @@ from deltas_nets.rooms import render_room
 from deltas_nets.weights_file import load_model
 
 REAL = ("hololens", "sevenscenes_reg", "tum_fr3_cabinet")
-BY_DAY = ("inverted", "K transposed", "one K in three", "five frames late", "one pose in ten")
+BY_DAY = (
+    "inverted",
+    "K transposed",
+    "one K in three",
+    "five frames late",
+    "rotations inverted",
+    "one pose in ten",
+)
 
 
 class Looked(NamedTuple):

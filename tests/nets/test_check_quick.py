@@ -12,6 +12,7 @@ from PIL import Image, ImageFilter
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.check.depth_files import unreadable_depth
 from deltas_nets.check.finding import Fault
 from deltas_nets.check.image_sizes import wrong_sizes
 from deltas_nets.check.images import look_at_images
@@ -50,7 +51,29 @@ def test_a_planted_fault_is_named_and_its_mend_mends_it(name: str, whole: Captur
     if found.mend is not None:
         assert causes(found.mend(planted)) == []
     else:
-        assert cause is Fault.NO_BASELINE
+        # A unit that nothing measures is told, and not mended.
+        assert cause in (Fault.NO_BASELINE, Fault.NOT_METRES)
+
+
+@pytest.mark.parametrize("name", ["centre at 0", "centre in parts of the image"])
+def test_a_centre_that_nobody_stated_leaves_the_focal_length(name: str, whole: Capture) -> None:
+    planted = CAMERAS[name][0](whole)
+    (found,) = quick_findings(planted)
+    assert found.mend is not None and "cx 63.5 cy 47.5" in found.cure
+    K = found.mend(planted).frames.K
+    assert (K[:, 0, 0] == whole.frames.K[:, 0, 0]).all() and (K[:, 0, 2] == 63.5).all()
+
+
+def test_a_K_in_parts_of_the_image_is_multiplied(whole: Capture) -> None:
+    planted = CAMERAS["K in parts of the image"][0](whole)
+    (found,) = quick_findings(planted)
+    assert found.mend is not None and "multiply" in found.cure
+    assert np.allclose(found.mend(planted).frames.K, whole.frames.K)
+
+
+def test_both_units_that_poses_may_have_are_told(whole: Capture) -> None:
+    (found,) = quick_findings(CAMERAS["millimetres"][0](whole))
+    assert "centimetres" in found.cure and "millimetres" in found.cure
 
 
 def test_lost_poses_are_named_by_frame(make_capture: MakeCapture) -> None:
@@ -82,6 +105,24 @@ def test_sizes_that_are_swapped_are_named_and_mended(whole: Capture) -> None:
     assert found.cause is Fault.SIDES_SWAPPED and found.mend is not None
     mended = found.mend(planted)
     assert wrong_sizes(mended) == [] and (mended.frames.K == whole.frames.K).all()
+
+
+def test_images_that_are_all_broken_are_not_left_out(whole: Capture) -> None:
+    for frame in whole.frames.values():
+        frame.image_path.write_bytes(b"no image")
+    (found,) = look_at_images(whole)
+    assert found.cause is Fault.IMAGES_UNREADABLE and found.frames == ()
+    assert found.mend is None and "leave out" not in found.cure
+
+
+def test_depth_that_no_command_can_read_is_named(whole: Capture) -> None:
+    assert unreadable_depth(whole) == []
+    for frame in whole.frames.values():
+        assert frame.depth_path is not None
+        Image.new("L", (128, 96), 100).save(frame.depth_path)
+    (found,) = unreadable_depth(whole)
+    assert found.cause is Fault.DEPTH_UNREADABLE and found.severity == "warning"
+    assert "pixels of type L" in found.evidence and len(found.frames) == 9
 
 
 def test_blurred_broken_and_repeated_images_are_named(whole: Capture) -> None:

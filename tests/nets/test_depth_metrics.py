@@ -59,3 +59,12 @@ def test_shapes_must_agree_and_a_mean_needs_a_map() -> None:
         depth_metrics([1.0], [[1.0]])
     with pytest.raises(ValueError, match="no depth map"):
         mean_metrics([])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_mean_of_maps_without_predictions_is_nan_without_a_word() -> None:
+    nothing, one = depth_metrics([0.0], [1.0]), depth_metrics([1.5], [1.0])
+    assert nothing is not None and one is not None
+    assert np.isnan(mean_metrics([nothing, nothing]).abs_rel)
+    mean = mean_metrics([nothing, one])
+    assert (mean.abs_rel, mean.coverage) == (0.5, 0.5)

@@ -1,0 +1,116 @@
+"""A cause is named only if it explains: what is left is small, of nearly all frames, and known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from check_plants import UNITY, frames, in_parts, poses, scaled
+from PIL import Image
+from room_capture import write_scene
+
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.check.evidence import evidence_of
+from deltas_nets.check.finding import Fault, Finding
+from deltas_nets.check.guesses import improved_guess
+from deltas_nets.check.judging import judge_matches
+from deltas_nets.check.matched import Matched, match_capture
+from deltas_nets.check.time_shift import poses_of_other_frames
+from deltas_nets.check.trying import Tried
+from deltas_nets.check.unmatched import unmatched_frames
+from deltas_nets.check.verdict import check_capture
+from deltas_nets.rooms import render_room
+from deltas_nets.weights_file import load_model
+
+Looked = tuple[Capture, Matched]
+
+
+def written(folder: Path, num_views: int) -> Capture:
+    write_scene(folder, render_room(3, num_views=num_views, image_size=(192, 256)))
+    for depth in (folder / "depth").iterdir():
+        depth.unlink()
+    return open_capture(folder)
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Looked:
+    """Six frames: the fewer there are, the more explains them by accident."""
+    capture = written(tmp_path_factory.mktemp("room") / "capture", 6)
+    return capture, match_capture(capture, load_model())
+
+
+@pytest.mark.parametrize(
+    ("given", "after", "explains"),
+    [(6.6, 3.3, False), (29.0, 3.7, False), (4.5, 1.5, False), (2.2, 0.9, True), (6.6, 0.2, True)],
+)
+def test_what_is_left_must_be_what_clean_captures_leave(
+    given: float, after: float, explains: bool
+) -> None:
+    assert Tried(given, after).explains is explains
+
+
+def test_a_left_handed_world_of_six_frames_is_no_shift_of_frames(few: Looked) -> None:
+    capture, matched = few
+    planted = poses(lambda pose: UNITY @ pose @ UNITY)(capture)
+    (found,) = judge_matches(planted, matched)[0]
+    assert found.cause is Fault.OTHER_AXES and found.mend is not None
+    assert judge_matches(found.mend(planted), matched)[0] == []
+
+
+@pytest.mark.parametrize(("late", "told"), [(1, True), (3, False)])
+def test_a_shift_that_leaves_half_of_the_frames_is_none(late: int, told: bool, few: Looked) -> None:
+    capture, matched = few
+    planted = poses(lambda pose: np.roll(pose, late, 0))(capture)
+    found = poses_of_other_frames(planted, matched, evidence_of(matched))
+    assert (found is not None) is told
+
+
+def test_poses_of_two_faults_have_no_single_cause(few: Looked) -> None:
+    capture, matched = few
+    generator = np.random.default_rng(0)
+    planted = poses(lambda pose: pose[generator.permutation(len(pose))])(capture)
+    (found,) = judge_matches(planted, matched)[0]
+    assert found.cause is Fault.UNEXPLAINED and found.mend is None
+
+
+@pytest.mark.parametrize("cause", [Fault.UNEXPLAINED, Fault.FEW_MATCHES])
+def test_a_guess_that_matches_do_not_confirm_is_not_written(cause: Fault, few: Looked) -> None:
+    planted = frames(in_parts)(few[0])
+
+    def mend(capture: Capture) -> Capture:
+        return capture
+
+    guess = Finding(Fault.NONSENSE_CALIBRATION, "odd", (), "calibrate", "error", mend)
+    doubt = Finding(cause, "off", (), "look", "error")
+    improved, left = improved_guess(guess, [doubt], planted)
+    assert improved.mend is None and left == [doubt]
+    assert improved_guess(guess, [], planted)[0].mend is mend
+
+
+def test_centimetres_are_told_and_not_mended(few: Looked) -> None:
+    capture, matched = few
+    planted = poses(lambda pose: scaled(pose, 100))(capture)
+    (found,) = judge_matches(planted, matched)[0]
+    assert found.cause is Fault.NOT_METRES and found.mend is None
+    assert "0.01" in found.cure and found.severity == "warning"
+
+
+def test_an_image_that_is_upside_down_is_named_with_its_exif(tmp_path: Path) -> None:
+    capture = written(tmp_path / "capture", 6)
+    path = capture.frames["2"].image_path
+    image = Image.open(path)
+    exif = image.getexif()
+    exif[0x112] = 3
+    image.transpose(Image.Transpose.ROTATE_180).save(path, exif=exif)
+    matched = match_capture(capture, load_model())
+    (found,) = unmatched_frames(capture, matched)
+    assert found.frames == ("2",) and found.severity == "warning"
+    assert "EXIF" in found.evidence and "orientation 3" in found.evidence
+
+
+def test_nothing_is_said_of_matches_where_no_image_can_be_read(tmp_path: Path) -> None:
+    capture = written(tmp_path / "capture", 3)
+    for grey, frame in enumerate(capture.frames.values()):
+        Image.fromarray(np.full((192, 256), 900 + grey, np.uint16)).save(frame.image_path)
+    (found,) = check_capture(capture, load_model()).findings
+    assert found.cause is Fault.IMAGES_UNREADABLE and found.mend is None
