@@ -43,7 +43,8 @@ def grouped_help(text: str, groups: Mapping[str, Sequence[str]]) -> str:
         return text
     width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
     paragraphs = re.split(r"\n\s*\n", before.strip())
-    lines = ["\n\n".join("\n".join(wrap(paragraph, width)) for paragraph in paragraphs)]
+    wrapped = [wrap(paragraph, width, break_on_hyphens=False) for paragraph in paragraphs]
+    lines = ["\n\n".join(map("\n".join, wrapped))]
     for title, names in {**groups, "more" if groups else "options": ()}.items():
         listed = {name: place for place, name in enumerate(names)}
         mine = [option for option in options if option.name in listed]
