@@ -51,8 +51,6 @@ def normal_matrix(
     Returns:
         D (D + 1) / 2 entries ``(*B, N)``.
     """
-    if torch.compiler.is_compiling():
-        return _by_views(coefficients, x, y, squared)
     if squared.shape[-1] != x.shape[-1]:  # weights of the cameras, which are fewer than points
         of_square, of_x, of_y, of_one = (coefficients * squared.unsqueeze(-1)).unbind(dim=-2)
         factors = torch.cat([of_square, of_x, of_y, of_one.sum(dim=-2, keepdim=True)], dim=-2)
@@ -62,18 +60,6 @@ def normal_matrix(
     square = torch.addcmul(x * across, y, down)
     terms = torch.cat([square, across, down, squared], dim=-2)
     return over_views(coefficients.transpose(-3, -2).flatten(-3, -2).mT, terms)
-
-
-def _by_views(coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor) -> tuple[Tensor, ...]:
-    """The same entry by entry, so that a compiler fuses it with what follows."""
-    entries = [torch.zeros_like(x[..., 0, :])] * coefficients.shape[-1]
-    for view, one in enumerate(coefficients.unbind(dim=-3)):
-        weight, along, down = (part[..., view, :] for part in (squared, x, y))
-        square = along * along + down * down
-        for n, column in enumerate(one.unbind(dim=-1)):
-            a, b, c, d = (factor.unsqueeze(-1) for factor in column.unbind(dim=-1))
-            entries[n] = entries[n] + weight * (a * square + b * along + c * down + d)
-    return tuple(entries)
 
 
 def normal_coefficients(proj: Tensor) -> Tensor:

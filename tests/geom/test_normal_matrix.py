@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from deltas_geom.numerics.symmetric3 import inverse3, solve3
 from deltas_geom.numerics.vectors import Symmetric3
 from deltas_geom.testing.strategies import extreme, scales, vectors
-from deltas_geom.triangulation.dlt import _by_views, normal_coefficients, normal_matrix, rows
+from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix, rows
 from deltas_geom.triangulation.uncertainty import unpacked3
 
 EPS = torch.finfo(torch.float64).eps
@@ -182,11 +182,14 @@ def test_batches_broadcast_cameras_against_points() -> None:
 
 
 @pytest.mark.parametrize("columns", [3, 4])
-def test_view_by_view_it_is_the_product(columns: int) -> None:
+@pytest.mark.parametrize("count", [7, 1], ids=["weights of each point", "of all"])
+def test_it_is_the_product_of_the_rows(columns: int, count: int) -> None:
     random = torch.Generator().manual_seed(5)
     proj = torch.randn(2, 3, 3, columns, generator=random, dtype=torch.float64)
     x, y = torch.randn(2, 2, 3, 7, generator=random, dtype=torch.float64)
-    for count in (7, 1):  # weights of each point, or of all
-        squared = torch.rand(2, 3, count, generator=random, dtype=torch.float64)
-        seen = normal_coefficients(proj), x, y, squared
-        assert_close(torch.stack(_by_views(*seen)), torch.stack(normal_matrix(*seen)))
+    squared = torch.rand(2, 3, count, generator=random, dtype=torch.float64)
+    found = torch.stack(normal_matrix(normal_coefficients(proj), x, y, squared), dim=-1)
+    pixels, weights = torch.stack([x, y], dim=-1), squared.sqrt().expand(2, 3, 7)
+    stacked = rows(proj[:, None], pixels.transpose(1, 2), weights.transpose(1, 2))
+    row, column = torch.triu_indices(columns, columns)
+    assert_close(found, (stacked.mT @ stacked)[..., row, column])
