@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Followed
 
-__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor"]
+__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor", "spread"]
+
+Item = TypeVar("Item")
 
 ANCHORS = 5
 """Frames that are looked at."""
@@ -76,11 +79,11 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
     with_sensor = [id for id, frame in capture.frames.items() if frame.depth_path is not None]
     ratios: list[float] = []
     position = {id: number for number, id in enumerate(capture.frames)}
-    for id in _spread(with_sensor, 4 * ANCHORS):
+    for id in spread(with_sensor, 4 * ANCHORS):
         ratios += _ratios_at_points(capture, position[id]).tolist()
     if len(ratios) < ENOUGH:
         search = Followed(capture)
-        for views in _some(capture, anchors=_spread(with_sensor, ANCHORS)):
+        for views in _some(capture, anchors=spread(with_sensor, ANCHORS)):
             depth = search(predictor, views, config).map.depth
             measured = depth_at_image(capture.frame(views.anchor))
             both = (depth > 0) & (measured > 0)
@@ -136,11 +139,11 @@ def _ratios_at_points(capture: Capture, position: int) -> FloatArray:
 def _some(
     capture: Capture, *, working_depth: float | None = None, anchors: Sequence[str] | None = None
 ) -> tuple[ViewSet, ...]:
-    chosen = _spread(list(capture.frames), ANCHORS) if anchors is None else anchors
+    chosen = spread(list(capture.frames), ANCHORS) if anchors is None else anchors
     return choose_view_sets(capture, 3, working_depth=working_depth, anchors=chosen)
 
 
-def _spread(ids: Sequence[str], count: int) -> list[str]:
-    """So many of the ids, evenly."""
-    places = np.linspace(0, len(ids) - 1, min(count, len(ids)))
-    return [ids[round(place)] for place in places]
+def spread(items: Sequence[Item], count: int) -> list[Item]:
+    """So many of the items, evenly: the first and the last are among them."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items)))
+    return [items[round(place)] for place in places]

@@ -7,14 +7,14 @@ counts for more depends on the capture, and the network's own confidence tells i
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.straight import straight
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.check.workers import side_by_side
 from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.first_look import spread
 from deltas_nets.predict.ours import work_size_of
+from deltas_nets.predict.passes import SMALL
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Found, Search
 
@@ -24,8 +24,6 @@ LARGE_PIXELS = 310_000
 """Pixels of an image of 480 x 640, and a few more for other aspect ratios."""
 TRIED = 6
 """View sets at most, spread over the capture."""
-UNSEEN = (96, 128)
-"""(height, width) of maps that nobody sees."""
 AS_SURE = 0.01
 """Confidence by which larger images may be behind: on rooms they are as good there."""
 
@@ -55,7 +53,7 @@ def surest_config(
         UserError: an image cannot be read.
     """
     larger = with_larger_images(config)
-    few = some_of(view_sets)
+    few = spread(view_sets, TRIED)
 
     def grows(views: ViewSet) -> bool:
         frame = straight(capture.frame(views.anchor))
@@ -66,7 +64,7 @@ def surest_config(
 
     def gain(views: ViewSet) -> float:
         usual, large = (
-            _confidence(search(predictor, views, replace(each, size=UNSEEN)))
+            _confidence(search(predictor, views, replace(each, size=SMALL)))
             for each in (config, larger)
         )
         report(views.anchor)
@@ -94,12 +92,6 @@ def surer(config: PredictConfig, gains: Sequence[float]) -> PredictConfig:
         True
     """
     return with_larger_images(config) if sum(gains) / len(gains) >= -AS_SURE else config
-
-
-def some_of(view_sets: Sequence[ViewSet]) -> list[ViewSet]:
-    """Those that are tried, evenly spread."""
-    places = np.linspace(0, len(view_sets) - 1, min(TRIED, len(view_sets)))
-    return [view_sets[round(place)] for place in places]
 
 
 def _confidence(found: Found) -> float:

@@ -24,13 +24,13 @@ from deltas_nets.predict.depth_map import (
     PredictConfig,
     Wanted,
 )
+from deltas_nets.predict.first_look import spread
 from deltas_nets.predict.ours import num_points, work_size_of
 from deltas_nets.predict.search import Asked
 from deltas_nets.predict.trial import (
     AS_SURE,
     LARGE_PIXELS,
     TRIED,
-    some_of,
     surer,
     surest_config,
     with_larger_images,
@@ -101,7 +101,7 @@ def test_the_mean_of_what_is_gained_decides(gains: list[float]) -> None:
 @given(count=st.integers(1, 300))
 def test_what_is_tried_is_spread_over_the_capture(count: int) -> None:
     sets = [ViewSet(str(k), ()) for k in range(count)]
-    places = [int(views.anchor) for views in some_of(sets)]
+    places = [int(views.anchor) for views in spread(sets, TRIED)]
     assert places == sorted(set(places))
     assert len(places) == min(count, TRIED)
     assert places[0] == 0
