@@ -14,16 +14,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from deltas_geom import PosedViews
 from deltas_nets import load_model
 from deltas_nets.captures.posed_images import PosedImages
+from deltas_nets.evaluate.depth_metrics import depth_metrics
 from deltas_nets.evaluate.rooms import DisturbedRooms
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.ours import num_points
-from deltas_nets.predict.trial import AS_SURE
+from deltas_nets.predict.trial import AS_SURE, surer
 from deltas_nets.rooms import Rooms
 
 USUAL, LARGE = (288, 384), (480, 640)
@@ -37,6 +38,11 @@ class Compared(NamedTuple):
     usual: float
     large: float
     gain: float
+
+    @property
+    def chosen(self) -> float:
+        """Abs Rel at the size that is chosen."""
+        return self.usual if surer(PredictConfig(), [self.gain]) == PredictConfig() else self.large
 
 
 def main() -> None:
@@ -53,7 +59,7 @@ def main() -> None:
             better = sum(each.large < each.usual for each in some)
             print(f"{low:6.2f} to {high:5.2f} {len(some):10} {usual:7.4f} {large:7.4f} {better:8}")
     usual, large, _ = np.mean(found, axis=0)
-    chosen = np.mean([each.large if each.gain >= -AS_SURE else each.usual for each in found])
+    chosen = np.mean([each.chosen for each in found])
     print(f"all {count:20} {usual:7.4f} {large:7.4f}   as chosen {chosen:.4f}")
 
 
@@ -71,12 +77,9 @@ def seen(model: Deltas, room: PosedImages, size: tuple[int, int]) -> tuple[float
     found = model(images[None].clamp(0, 1), views, RANGE, num_keypoints=points)
     depth = F.interpolate(found.depth, size=LARGE, mode="bilinear")[0, 0]
     sure = KnownDepth(found.depth, found.std / found.depth).confidence().mean()
-    return error(depth, room.depth[0]), float(sure)
-
-
-def error(depth: Tensor, truth: Tensor) -> float:
-    known = (truth > RANGE[0]) & (truth < RANGE[1])
-    return float(((depth - truth).abs() / truth)[known].mean())
+    scored = depth_metrics(depth.numpy(), room.depth[0].numpy(), depth_range=RANGE)
+    assert scored is not None  # all of a room has depth
+    return scored.abs_rel, float(sure)
 
 
 if __name__ == "__main__":

@@ -5,17 +5,11 @@ from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from deltas_geom import PosedViews
-from deltas_geom.diagnosis.evidence import Evidence
-from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.check.finding import Fault, Finding
-from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import changing_poses
-from deltas_nets.check.trying import Suspect, tried
+from deltas_nets.check.trying import Case, Suspect
 
 __all__ = ["other_axes"]
 
@@ -72,28 +66,17 @@ class _Axes(NamedTuple):
         return ", then ".join(steps)
 
 
-def other_axes(
-    capture: Capture, matched: Matched, evidence: Evidence, given: Tensor
-) -> Suspect | None:
-    """The way to write poses with which matches fit best, if that explains them.
-
-    Args:
-        capture: as it was read.
-        matched: its matches.
-        evidence: the same, of pairs.
-        given: ``(P)`` px, residuals as the capture has it.
-    """
-    views = matched.views(capture.frames)
-    poses = views.cam_from_world.numpy()
+def other_axes(case: Case) -> Suspect | None:
+    """The way to write poses with which matches fit best, if that explains them."""
     best: Suspect | None = None
     for axes in _all_axes():
-        found = tried(evidence, given, PosedViews(views.K, torch.from_numpy(axes.mended(poses))))
+        mend = changing_poses(axes.mended)
+        found = case.mended(mend)
         explains = found.explains and found.after <= _LEFT * found.given
         # Cameras that hardly turn fit several: the first is the simplest.
         if explains and (best is None or found.after < 0.8 * best.tried.after):
             cause = Fault.OTHER_AXES
             what = f"axes as {axes.in_words} fit: {found.in_words}"
-            mend = changing_poses(axes.mended)
             best = Suspect(found, Finding(cause, what, (), axes.cure, "error", mend))
     return best
 

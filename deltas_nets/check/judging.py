@@ -23,7 +23,7 @@ from deltas_nets.check.quaternions import other_quaternions
 from deltas_nets.check.scale import wrong_scale
 from deltas_nets.check.sensor import sensors
 from deltas_nets.check.time_shift import poses_of_other_frames
-from deltas_nets.check.trying import ENOUGH
+from deltas_nets.check.trying import ENOUGH, Case
 from deltas_nets.check.whole import diagnosed, of_all_cameras
 
 __all__ = ["Figures", "judge_matches"]
@@ -69,7 +69,7 @@ def judge_matches(capture: Capture, matched: Matched) -> tuple[list[Finding], Fi
     figures = Figures(
         total, looked, pairs, int(evidence.counts.sum()), float(given.median()), fit, 0.0
     )
-    found = _explained(capture, matched, evidence, given)
+    found = _explained(Case(capture, matched, evidence, given))
     if found and found[0].cause in LENSES:
         return found, figures
     return [*found, *_by_sensor(_same_frames(capture, found), matched, evidence)], figures
@@ -102,18 +102,17 @@ def _by_sensor(capture: Capture, matched: Matched, evidence: Evidence) -> list[F
     return [*wrong, *unregistered_depth(capture, known, pairs)]
 
 
-def _explained(
-    capture: Capture, matched: Matched, evidence: Evidence, given: torch.Tensor
-) -> list[Finding]:
+def _explained(case: Case) -> list[Finding]:
+    capture, matched, evidence, given = case
     diagnosis = diagnosed(capture, matched)
     suspects = [
         suspect
         for suspect in (
-            *of_all_cameras(capture, matched, evidence, given),
+            *of_all_cameras(case),
             poses_of_other_frames(capture, matched, evidence),
             *wrong_kinds(capture, matched, evidence),
             *wrong_lenses_of_matches(capture, matched, evidence),
-            *other_quaternions(capture, matched, evidence, given),
+            *other_quaternions(case),
         )
         if suspect is not None
     ]
@@ -126,7 +125,7 @@ def _explained(
             next(s for s in suspects if s.tried.after <= 1.25 * best.tried.after + 0.05).finding
         ]
     if level(given) > ENOUGH:
-        otherwise = other_axes(capture, matched, evidence, given)
+        otherwise = other_axes(case)
         if otherwise is not None:
             return [otherwise.finding]
     strict = residuals(evidence, *matched.views(capture.frames), share=MOSTLY)

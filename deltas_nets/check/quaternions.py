@@ -3,18 +3,12 @@
 from collections.abc import Iterator
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from deltas_geom import PosedViews
-from deltas_geom.diagnosis.evidence import Evidence
-from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.rotations import quaternions_of, rotations_of
 from deltas_nets.check.finding import Fault, Finding
-from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import changing_poses
-from deltas_nets.check.trying import Suspect, tried
+from deltas_nets.check.trying import Case, Suspect
 
 __all__ = ["other_quaternions"]
 
@@ -22,32 +16,21 @@ ORDERS = {"x y z w": [3, 0, 1, 2], "w x y z": [1, 2, 3, 0]}
 """The order that the file has, read as the other of the two; where w, x, y and z then stand."""
 
 
-def other_quaternions(
-    capture: Capture, matched: Matched, evidence: Evidence, given: Tensor
-) -> Iterator[Suspect]:
-    """Orders that explain residuals, of world-to-camera rotations and of camera-to-world ones.
-
-    Args:
-        capture: as it was read.
-        matched: its matches.
-        evidence: the same, of pairs.
-        given: ``(P)`` px, residuals as the capture has it.
-    """
-    views = matched.views(capture.frames)
+def other_quaternions(case: Case) -> Iterator[Suspect]:
+    """Orders that explain residuals, of world-to-camera rotations and of camera-to-world ones."""
     for order in ORDERS:
         for inverted in (False, True):
 
             def change(poses: FloatArray, order: str = order, inv: bool = inverted) -> FloatArray:
                 return _reordered(poses, ORDERS[order], inverted=inv)
 
-            poses = torch.from_numpy(change(views.cam_from_world.numpy()))
-            found = tried(evidence, given, PosedViews(views.K, poses))
+            mend = changing_poses(change)
+            found = case.mended(mend)
             if found.explains:
                 other = next(name for name in ORDERS if name != order)
                 whose = "camera-to-world" if inverted else "world-to-camera"
                 what = f"{whose} quaternions as {order} fit: {found.in_words}"
                 cure = f"write quaternions as {other}: they are read so, and stand there as {order}"
-                mend = changing_poses(change)
                 yield Suspect(found, Finding(Fault.QUATERNION_ORDER, what, (), cure, "error", mend))
 
 

@@ -9,9 +9,21 @@ from torch import Tensor
 from deltas_geom import PosedViews
 from deltas_geom.diagnosis.evidence import Evidence, residuals
 from deltas_geom.diagnosis.trials import level
-from deltas_nets.check.finding import Finding
+from deltas_nets.captures.capture import Capture
+from deltas_nets.check.finding import Finding, Mend
+from deltas_nets.check.matched import Matched
 
-__all__ = ["ENOUGH", "MENDED", "Suspect", "Tried", "common", "rounded", "searched", "tried"]
+__all__ = [
+    "ENOUGH",
+    "MENDED",
+    "Case",
+    "Suspect",
+    "Tried",
+    "common",
+    "rounded",
+    "searched",
+    "tried",
+]
 
 ENOUGH = 2.0
 """px at the size that frames are looked at (about 400 wide): cameras that fit are below."""
@@ -64,6 +76,26 @@ class Suspect(NamedTuple):
 def tried(evidence: Evidence, given: Tensor, views: PosedViews) -> Tried:
     """Try cameras on pairs whose residuals ``(P)`` are known as given."""
     return Tried(level(given), level(residuals(evidence, *views)))
+
+
+class Case(NamedTuple):
+    """A capture whose cameras are judged by its matches.
+
+    Attributes:
+        capture: as it was read.
+        matched: its matches.
+        evidence: the same, of P pairs.
+        given: ``(P)`` px, residuals as the capture has it.
+    """
+
+    capture: Capture
+    matched: Matched
+    evidence: Evidence
+    given: Tensor
+
+    def mended(self, mend: Mend) -> Tried:
+        """What a cure makes of residuals, by the cameras that it really writes."""
+        return tried(self.evidence, self.given, self.matched.views(mend(self.capture).frames))
 
 
 def searched(cost: Callable[[float], float], low: float = 0.2, high: float = 5.0) -> float:

@@ -4,11 +4,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from deltas_geom import diagnose
 from deltas_geom.diagnosis.causes import Cause
-from deltas_geom.diagnosis.evidence import Evidence
 from deltas_geom.diagnosis.hypotheses import MENDS
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_nets.captures.capture import Capture
@@ -17,7 +15,7 @@ from deltas_nets.check.finding import Fault, Finding, Mend
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import changing_frames, changing_poses
 from deltas_nets.check.rewrite import with_K
-from deltas_nets.check.trying import ENOUGH, Suspect, tried
+from deltas_nets.check.trying import ENOUGH, Case, Suspect
 
 __all__ = ["diagnosed", "of_all_cameras"]
 
@@ -68,20 +66,11 @@ def diagnosed(capture: Capture, matched: Matched) -> Diagnosis:
     )
 
 
-def of_all_cameras(
-    capture: Capture, matched: Matched, evidence: Evidence, given: Tensor
-) -> Iterator[Suspect]:
-    """Causes of all cameras that explain residuals, each judged by what its mend makes of files.
-
-    Args:
-        capture: as it was read.
-        matched: its matches.
-        evidence: the same, of pairs.
-        given: ``(P)`` px, residuals as the capture has it.
-    """
+def of_all_cameras(case: Case) -> Iterator[Suspect]:
+    """Causes of all cameras that explain residuals, each judged by what its mend makes of files."""
     for cause, known in KNOWN.items():
         mend = _mend(cause)
-        found = tried(evidence, given, matched.views(mend(capture).frames))
+        found = case.mended(mend)
         if found.explains:
             finding = Finding(known.fault, found.in_words, (), known.cure, "error", mend)
             yield Suspect(found, finding)

@@ -28,6 +28,7 @@ from deltas_geom import PosedViews, ShapeError, diagnose, invert_pose
 from deltas_geom.diagnosis.causes import CURES, Cause
 from deltas_geom.diagnosis.evidence import gather_evidence, residuals
 from deltas_geom.diagnosis.results import Diagnosis, Explanation
+from deltas_geom.diagnosis.trials import Trial, explains
 from deltas_geom.testing import seeded_scene
 
 # A diagnosis tries every cause: few examples, of which the first is a pattern that nothing moved.
@@ -310,3 +311,14 @@ def test_one_wrong_camera_is_told_from_all_where_the_others_fit() -> None:
     mask[1, ::2] = mask[2, 1::2] = False
     found = diagnose(PosedViews(K, pose), pixels, mask=mask)
     assert found.cause is Cause.POSES_INVERTED and found.cameras == (2,)
+
+
+@pytest.mark.parametrize("before", [1.1, 10.0, 100.0])
+@pytest.mark.parametrize(("after", "enough"), [(0.05, True), (1.5, False)])
+def test_what_is_left_must_be_what_cameras_leave_that_fit(
+    before: float, after: float, enough: bool
+) -> None:
+    hypothesis: Any = None  # residuals alone decide
+    all_pairs = torch.ones(5, dtype=torch.bool)
+    given, trial = (Trial(hypothesis, torch.full((5,), r), all_pairs) for r in (before, after))
+    assert explains(given, trial, threshold=1.0) == enough

@@ -10,6 +10,7 @@ from room_capture import write_scene
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.check.axes import other_axes
 from deltas_nets.check.evidence import evidence_of
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.guesses import improved_guess
@@ -114,3 +115,14 @@ def test_nothing_is_said_of_matches_where_no_image_can_be_read(tmp_path: Path) -
         Image.fromarray(np.full((192, 256), 900 + grey, np.uint16)).save(frame.image_path)
     (found,) = check_capture(capture, load_model()).findings
     assert found.cause is Fault.IMAGES_UNREADABLE and found.mend is None
+
+
+@pytest.mark.parametrize(("given", "named"), [(4.0, False), (6.0, True)])
+def test_of_so_many_axes_one_must_leave_a_quarter(given: float, named: bool) -> None:
+    class OneFits:
+        """All axes leave 1.2 px of it: less than half of 4 px, less than a quarter of 6."""
+
+        def mended(self, mend: object) -> Tried:
+            return Tried(given, 1.2)
+
+    assert (other_axes(OneFits()) is not None) == named  # type: ignore[arg-type]
