@@ -18,6 +18,7 @@ from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
+from deltas_nets.predict.described import AtSize
 from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
@@ -65,6 +66,11 @@ class Disturbed:
     def redrawn(self, anchor: Frame, agreed: KnownDepth) -> KnownDepth:
         """As the network, which sees the changed image."""
         return self.inner.redrawn(self.change(anchor), agreed)
+
+    def compared(self, anchor: AtSize, drawn: KnownDepth, around: Sequence[AtSize]) -> KnownDepth:
+        """As the network, which sees the changed images."""
+        mine, *others = (seen._replace(frame=self.change(seen.frame)) for seen in (anchor, *around))
+        return self.inner.compared(mine, drawn, others)
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """As the network."""

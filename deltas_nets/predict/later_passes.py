@@ -1,6 +1,6 @@
 """The later passes over a capture: each map hears those of the frames around it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -12,23 +12,24 @@ from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.neighbours import neighbours, sample
-from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.straight import straight
 from deltas_nets.errors import UserError
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.unit import unit_of
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
+from deltas_nets.predict.described import AtSize
+from deltas_nets.predict.first_look import spread
 from deltas_nets.predict.look import as_photographed
+from deltas_nets.predict.predictor import Predictor
 
 __all__ = ["LaterPasses"]
 
 REMEMBERED = 64
 """Maps of a pass that are kept in memory: 0.7 MB each."""
-
-
-Redrawn = Callable[[Frame, KnownDepth], KnownDepth]
-"""As of :class:`deltas_nets.predict.predictor.Predictor`."""
+COMPARED = 8
+"""Frames around that a map is compared with."""
 
 
 class _First(NamedTuple):
@@ -49,16 +50,16 @@ class LaterPasses:
         capture: the frames.
         first: the maps of the first pass.
         ids: the frames that have one.
-        redrawn: the last touch that a map of a frame gets.
+        predictor: gives maps the last touch.
 
     Raises:
         UserError: a map is missing or damaged.
     """
 
     def __init__(
-        self, capture: Capture, first: FirstMaps, ids: Sequence[str], redrawn: Redrawn
+        self, capture: Capture, first: FirstMaps, ids: Sequence[str], predictor: Predictor
     ) -> None:
-        self.capture, self.redrawn = capture, redrawn
+        self.capture, self.predictor = capture, predictor
         self.first = first
         self._read = lru_cache(maxsize=2 * REMEMBERED)(self._from_disk)
         points, views, sizes = [], [], []
@@ -106,7 +107,7 @@ class LaterPasses:
 
     @torch.inference_mode()
     def drawn(self, id: str, found: KnownDepth) -> KnownDepth:
-        """A map that has heard, as its image shows it.
+        """A map that has heard, as its image shows it, and compared with those around it.
 
         Raises:
             UserError: the image cannot be read.
@@ -116,8 +117,15 @@ class LaterPasses:
             return found
         anchor = straight(self.capture.frame(id))
         unit = unit_of(float(known.median()), self.capture.metric)
-        drawn = self.redrawn(anchor, found._replace(depth=found.depth * unit))
-        return drawn._replace(depth=drawn.depth / unit)
+        drawn = self.predictor.redrawn(anchor, found._replace(depth=found.depth * unit))
+        drawn = drawn._replace(depth=drawn.depth / unit)
+        around = [self._at_size(near) for near in spread(self._around[id], COMPARED)]
+        return self.predictor.compared(self._at_size(id), drawn, around)
+
+    def _at_size(self, id: str) -> AtSize:
+        """A frame as the network saw it."""
+        depth = self._read(self.first, id).map.depth
+        return AtSize(straight(self.capture.frame(id)), (depth.shape[-2], depth.shape[-1]))
 
     def _from_disk(self, told: FirstMaps, id: str) -> _First:
         read = told.read(id)

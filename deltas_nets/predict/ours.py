@@ -18,6 +18,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.network.batch import with_batch_dims
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.predict.depth_map import (
     DepthMap,
@@ -27,6 +28,7 @@ from deltas_nets.predict.depth_map import (
     finished_map,
     keypoint_depths,
 )
+from deltas_nets.predict.described import AtSize, DescribedFrames
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.without_points import map_without_points
 from deltas_nets.weights_file import weights_record
@@ -71,6 +73,7 @@ class DeltasPredictor:
 
     def __init__(self, model: Deltas, *, without_points: bool = False) -> None:
         self.encode = EncodedFrames(model)
+        self.describe = DescribedFrames(self.encode)
         self.without_points = without_points
 
     def varied(self, settings: NetworkSettings) -> "DeltasPredictor":
@@ -110,6 +113,11 @@ class DeltasPredictor:
         device = next(model.parameters()).device
         of_one = KnownDepth(*(part[None].to(device) for part in agreed))
         return KnownDepth(*(part[0].cpu() for part in model.redrawn(encoded, of_one)))
+
+    def compared(self, anchor: AtSize, drawn: KnownDepth, around: Sequence[AtSize]) -> KnownDepth:
+        """By its descriptors, if they are as fine as those of deltas-small."""
+        fine = isinstance(self.encode.model.encoder, LiteEncoder)
+        return self.describe.compared(anchor, drawn, around) if fine else drawn
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """The network itself."""

@@ -85,9 +85,8 @@ class Passes:
         """
         first = self.folder.first
         self._all("depth", [views for views in seen if first.read(views.anchor) is None], self._see)
-        later = LaterPasses(
-            self.capture, first, [views.anchor for views in seen], self.predictor.redrawn
-        )
+        ids = [views.anchor for views in seen]
+        later = LaterPasses(self.capture, first, ids, self.predictor)
         told = first
         for number in range(2, passes):
             told = self._passed_on(later, told, number, seen)

@@ -17,6 +17,7 @@ from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.dense import DensePredictor
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted
+from deltas_nets.predict.described import AtSize
 from deltas_nets.predict.ours import DeltasPredictor
 from deltas_nets.predict.reference import ReferencePredictor
 from deltas_nets.weights_file import load_network, weights_file
@@ -72,6 +73,21 @@ class Predictor(Protocol):
 
         Raises:
             UserError: the image cannot be read.
+        """
+
+    def compared(self, anchor: AtSize, drawn: KnownDepth, around: Sequence[AtSize]) -> KnownDepth:
+        """A map moved to where other frames show the same.
+
+        Args:
+            anchor: its frame.
+            drawn: ``(1, h, w)``, in the unit of the frames' poses.
+            around: those that see the same places.
+
+        Returns:
+            The same if the network has nothing to compare images by.
+
+        Raises:
+            UserError: an image cannot be read.
         """
 
     def varied(self, settings: NetworkSettings) -> "Predictor":

@@ -1,6 +1,7 @@
 """What networks and baselines have in common that take views and nothing else, and have no stages
 of a network of deltas."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from deltas_nets.captures.frame import Frame
@@ -8,6 +9,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.depth_map import PredictConfig, Wanted
+from deltas_nets.predict.described import AtSize
 
 __all__ = ["ViewsAlone"]
 
@@ -43,6 +45,10 @@ class ViewsAlone:
     def redrawn(self, anchor: Frame, agreed: KnownDepth) -> KnownDepth:
         """It stays: there is no stage that redraws."""
         return agreed
+
+    def compared(self, anchor: AtSize, drawn: KnownDepth, around: Sequence[AtSize]) -> KnownDepth:
+        """It stays: there are no descriptors."""
+        return drawn
 
     def deltas(self, refusal: str, where: str | Path, remedy: str) -> Deltas:
         """It is none."""

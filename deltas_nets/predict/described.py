@@ -1,0 +1,82 @@
+"""The frames of a capture by their descriptors, for maps that are compared with them."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from threading import Lock
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deltas_geom import PosedViews
+from deltas_geom.cameras.pixels import resize_intrinsics
+from deltas_nets.agree.compared import Described, compared
+from deltas_nets.captures.capture import Frame
+from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.predict.encoded_frames import EncodedFrames
+
+__all__ = ["AtSize", "DescribedFrames"]
+
+CAPACITY = 32
+"""Frames that are kept: 4 MB each at 240 x 320, 15 MB at 480 x 640."""
+
+
+class AtSize(NamedTuple):
+    """A straight frame, and the (height, width) at which the network saw it."""
+
+    frame: Frame
+    size: tuple[int, int]
+
+
+class DescribedFrames:
+    """Remembers the descriptors of the frames used last, which are a quarter of what is encoded.
+
+    Args:
+        encode: the encoder that makes them.
+        capacity: how many frames are remembered.
+    """
+
+    def __init__(self, encode: EncodedFrames, *, capacity: int = CAPACITY) -> None:
+        self.encode, self.capacity = encode, capacity
+        self._known: OrderedDict[tuple[object, ...], Tensor] = OrderedDict()
+        self._lock = Lock()  # threads share it
+
+    @torch.inference_mode()
+    def compared(self, anchor: AtSize, found: KnownDepth, others: Sequence[AtSize]) -> KnownDepth:
+        """A map ``(1, h, w)`` of the anchor, compared with other frames.
+
+        Raises:
+            UserError: an image cannot be read.
+        """
+        device = next(self.encode.model.parameters()).device
+        there = KnownDepth(*(part.to(device) for part in found))
+        moved = compared(there, self(anchor), [self(other) for other in others])
+        return KnownDepth(*(part.cpu() for part in moved))
+
+    def __call__(self, seen: AtSize) -> Described:
+        """A frame's descriptors and its camera at their size.
+
+        Raises:
+            UserError: the image cannot be read.
+        """
+        frame, maps = seen.frame, self._maps(seen)
+        size = (maps.shape[0], maps.shape[1])
+        K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
+        view = PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
+        return Described(maps.flatten(0, 1), size, view)
+
+    def _maps(self, seen: AtSize) -> Tensor:
+        """``(h, w, D)``."""
+        frame, size = seen
+        key = (frame.image_path, frame.image_span, size)
+        with self._lock:
+            known = self._known.get(key)
+        if known is None:
+            maps = self.encode([frame], work_size=size).encoded.descriptors.maps[0, 0]
+            known = maps.permute(1, 2, 0).float().contiguous()
+        with self._lock:
+            self._known[key] = known
+            self._known.move_to_end(key)
+            while len(self._known) > self.capacity:
+                self._known.popitem(last=False)
+        return known
