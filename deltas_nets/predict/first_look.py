@@ -1,6 +1,7 @@
 """What a few maps tell of a whole capture: how far its surfaces are, how long its unit is."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -73,6 +74,11 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
 
     It is compared with sparse points where frames see some, else with maps of a few frames.
 
+    Args:
+        predictor: of a trained network.
+        capture: the frames.
+        config: as for the maps that are written; here they are whole, and as large as the photos.
+
     Raises:
         UserError: no frame has sensor depth that can be compared.
     """
@@ -82,7 +88,7 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
     for id in spread(with_sensor, 4 * ANCHORS):
         ratios += _ratios_at_points(capture, position[id]).tolist()
     if len(ratios) < ENOUGH:
-        search = Followed(capture)
+        search, config = Followed(capture), _whole(config)
         for views in _some(capture, anchors=spread(with_sensor, ANCHORS)):
             depth = search(predictor, views, config).map.depth
             measured = depth_at_image(capture.frame(views.anchor))
@@ -102,14 +108,14 @@ def scale_by_measurements(
     Args:
         predictor: of a trained network.
         capture: the frames.
-        config: sizes; the map is as large as the photo.
+        config: as for the maps that are written; here they are whole, and as large as the photos.
         file: lines ``ID X Y METRES``: a frame, a pixel, and how far along the view what it shows
             is from the camera.
 
     Raises:
         UserError: the file is malformed, or names a frame or pixel that there is not.
     """
-    search, ratios = Followed(capture), []
+    search, config, ratios = Followed(capture), _whole(config), []
     for id, rows in measured_by_hand(file, capture).items():
         (views,) = _some(capture, anchors=[id])
         depth = search(predictor, views, config).map.depth
@@ -120,6 +126,11 @@ def scale_by_measurements(
                 raise UserError(what, file, "measure nearer to the middle of the photo")
             ratios.append(metres / found)
     return float(np.median(ratios))
+
+
+def _whole(config: PredictConfig) -> PredictConfig:
+    """For maps of the photo's own pixels, with a depth at all of them."""
+    return replace(config, size=None, min_confidence=0.0)
 
 
 def _ratios_at_points(capture: Capture, position: int) -> FloatArray:
