@@ -57,6 +57,10 @@ class Disturbed:
         """As the network."""
         self.inner.check_asked(config, capture, view_sets)
 
+    def check_measured(self) -> None:
+        """As the network."""
+        self.inner.check_measured()
+
     def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from what was made of all."""
         changed = [self.change(frame) for frame in wanted.frames]

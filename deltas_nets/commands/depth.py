@@ -118,6 +118,8 @@ class Depth(Captured, Measuring, Prediction):
         options = self._options()
         capture = self.opened(self.capture).remembering()
         predictor = self.predictor()
+        if self.sensor_depth is not None:
+            predictor.check_measured()
         capture = self.in_metres(capture, predictor, config)
         depth = None
         if not knows_its_scale(capture):  # then a few maps tell, before views are chosen

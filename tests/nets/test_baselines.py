@@ -131,6 +131,7 @@ def test_what_a_baseline_cannot_is_refused(
         "depth", folder, "--out", tmp_path / "out", "--weights", "plane-sweep", "--views", 2, *flags
     )
     assert_one_line(said, *parts)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_wrong_name_is_no_baseline(run: Run, folder: Path) -> None:
