@@ -55,6 +55,8 @@ class Capture:
     """Whether its unit is the metre; structure from motion alone does not know it."""
     scaled_by: float = 1.0
     """What its poses and points were multiplied with after they were read."""
+    depth_scaled_by: float = 1.0
+    """The same of its sensor depth, which is in metres already where that told the scale."""
     points: SparsePoints | None = None
     """What the program that found the poses triangulated, if it says so."""
     sources: Mapping[str, tuple[str, ...]] | None = None

@@ -39,7 +39,8 @@ class Convert(Command):
     images: Literal["copy", "link"] = "copy"
     """Copy images and depth, or link to where they are."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Length of the capture's unit, if you know it: what is written is in metres then."""
+    """Length of the capture's unit, if you know it, and of its depth files': what is written is in
+    metres then."""
     scale_from: Annotated[Path | None, tyro.conf.arg(metavar="sensor|FILE")] = None
     """Find that length by its sensor depth, which is in metres, or by a file of measured depths:
     lines ID X Y METRES."""
@@ -95,8 +96,7 @@ class Convert(Command):
 
     def _in_metres(self, capture: "Capture") -> "Capture":
         """The capture in metres if a flag says how, else as it is."""
-        from deltas_nets.captures.in_metres import in_metres
-        from deltas_nets.captures.scaled import scaled
+        from deltas_nets.captures.scaled import in_metres, scaled
 
         if self.scale is not None:
             return in_metres(capture, self.scale)

@@ -286,6 +286,7 @@ class Depth(Captured, Measuring, Prediction):
                 "layout": capture.layout,
                 "unit": options.unit,
                 "scaled_by": capture.scaled_by,
+                "depth_scaled_by": capture.depth_scaled_by,
                 "lost_poses": list(map(id_in_json, capture.lost)),
                 "sets_short_of_views": views.short,
             },

@@ -78,7 +78,7 @@ class Fuse(Command):
         """Run the command."""
         from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.scaled import scaled
+        from deltas_nets.captures.scaled import in_metres
 
         out = self.out or Path(f"{self.capture.resolve().stem}-fused")
         if out.resolve() == self.capture.resolve():
@@ -86,10 +86,9 @@ class Fuse(Command):
             raise UserError(what, out, "name another folder with --out")
         stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         capture = open_capture(self.capture, intrinsics=stated)
-        if self.scale is not None:
-            if not self.scale > 0:
-                raise UserError("no scale", f"--scale {self.scale:g}", "give a positive number")
-            capture = scaled(capture, self.scale)
+        # Maps know theirs, to the last digit, as their cameras are known by a hash.
+        if self.scale is not None and str(self.depths) == "sensor":
+            capture = in_metres(capture, self.scale)
         self.fuse(capture, out)
         show_fused(capture, self.depths, out)
 
