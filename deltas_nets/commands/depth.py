@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from deltas_nets import __version__
+from deltas_nets.commands.depth_options import asked_options, fitting_options
 from deltas_nets.commands.depth_telling import show, tell
-from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible, usable_device
+from deltas_nets.commands.flags import Captured, Flag, Prediction, usable_device
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
 from deltas_nets.commands.values import at_least_one, read_shard
 from deltas_nets.config import to_dict
-from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Depth(Captured, Measuring, Prediction):
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
-        options = self._options()
+        options = asked_options(self.depth_scale, self.format)
         capture = self.opened(self.capture).remembering()
         predictor = self.predictor()
         if self.sensor_depth is not None:
@@ -138,7 +138,7 @@ class Depth(Captured, Measuring, Prediction):
         for finding in quick_findings(capture):
             if finding.cause not in TOLD_BEFORE:
                 warn(f"{finding.cause.value} ({finding.evidence}): {finding.cure}")
-        options = self._fitting(options, capture, depth)
+        options = fitting_options(options, capture, depth, self.depth_scale, self.depth_range)
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)
         mine = found.view_sets[shard[0] - 1 :: shard[1]]
@@ -214,32 +214,6 @@ class Depth(Captured, Measuring, Prediction):
         if count > 1:
             print(f"{count} maps at a time, a core each (--workers)")
         return count
-
-    def _options(self) -> "OutputOptions":
-        from deltas_nets.outputs.products import OutputOptions
-
-        if self.depth_scale is not None and self.format != "png":
-            what = f"depth is written as float32 in {self.format}"
-            raise UserError(what, "--depth-scale", "leave it out")
-        given = {} if self.depth_scale is None else {"depth_scale": self.depth_scale}
-        return sensible(OutputOptions, depth_format=self.format, **given)
-
-    def _fitting(
-        self, options: "OutputOptions", capture: "Capture", depth: float | None
-    ) -> "OutputOptions":
-        """The options with the capture's unit, and steps that are fine and reach far enough."""
-        from deltas_nets.captures.known_depths import farthest_depth
-        from deltas_nets.captures.working_depth import working_depths
-        from deltas_nets.outputs.products import OWN_UNIT, check_depth_fits, steps_to
-
-        far = self.depth_range[1] if self.depth_range else farthest_depth(capture)
-        if not capture.metric:
-            options = replace(options, unit=OWN_UNIT)
-            usual = float(working_depths(capture).max()) if depth is None else depth
-            if self.depth_scale is None:
-                return replace(options, depth_scale=steps_to(max(far, 4 * usual)))
-        check_depth_fits((0.0, far), options)
-        return options
 
     def _folder(
         self,
