@@ -81,8 +81,8 @@ class Depth(Captured, Measuring, Prediction):
     page: bool = True
     """Also write index.html to look at, contact_sheet.jpg and preview/ID.jpg."""
     shard: str = "1/1"
-    """I/N: this run does every N-th frame from the I-th, for N runs at once; in the second pass it
-    hears its own frames alone."""
+    """I/N: this run does every N-th frame from the I-th, for N runs at once; in later passes it
+    hears no map that another run writes."""
     overwrite: Flag = False
     """Start again instead of continuing, or write into a folder that holds other things."""
 
@@ -125,12 +125,12 @@ class Depth(Captured, Measuring, Prediction):
         if not knows_its_scale(capture):  # then a few maps tell, before views are chosen
             with progress("first look", ROUNDS * ANCHORS) as report:
                 depth = depth_seen(predictor, capture, config, report=report)
-        anchors = keyframes(capture, working_depth=depth) if self.keyframes else None
+        wanted = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
-            found = lone_frames(capture, self.view_sets, anchors)
+            found = lone_frames(capture, self.view_sets, wanted)
         else:
             found = usable_view_sets(
-                capture, self.view_sets, self.views, working_depth=depth, anchors=anchors
+                capture, self.view_sets, self.views, working_depth=depth, anchors=wanted
             )
         check_all(capture, found.view_sets)
         if self.views != 1:
@@ -142,8 +142,12 @@ class Depth(Captured, Measuring, Prediction):
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)
         mine = found.view_sets[shard[0] - 1 :: shard[1]]
-        twice = self.passes > 1 and self.views != 1
-        heard = companions(capture, mine, working_depth=depth) if twice else ()
+        anchors = [views.anchor for views in found.view_sets]
+        heard = (
+            companions(capture, mine, working_depth=depth, elsewhere=anchors)
+            if self.passes > 1 and self.views != 1
+            else ()
+        )
         search = self._search(capture, [views.anchor for views in mine])
         threads = self._threads(len(mine))
         config = self._sized(config, predictor, capture, found.view_sets, search, threads)

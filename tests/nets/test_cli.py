@@ -12,14 +12,17 @@ import torch
 from PIL import Image
 from run_command import Result, Run, assert_one_line
 from run_fit import HELD_OUT
+from small_capture import write_capture
 
 from deltas_nets import __version__, cli
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.commands.command_line import parse
 from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS, DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs import products
 from deltas_nets.outputs.products import read_depth_png, read_points_ply
+from deltas_nets.predict.passes import Passes
 from deltas_nets.train import fit
 from deltas_nets.weights_file import save_weights
 
@@ -173,6 +176,21 @@ def test_shards_share_the_work(depth: DepthCommand) -> None:
     second = depth("--shard", "2/2")
     assert "--shard" not in second.out and depth.summary()["status"] == "complete"
     assert len(list((depth.out / "depth").iterdir())) == 4
+
+
+def test_a_shard_looks_at_no_frame_for_another(
+    depth: DepthCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked, see = [], Passes._see
+
+    def seen(self: Passes, views: ViewSet) -> None:
+        looked.append(views.anchor)
+        see(self, views)
+
+    monkeypatch.setattr(Passes, "_see", seen)
+    depth.capture = write_capture(depth.capture.parent / "six", 6)
+    assert depth("--shard", "1/2", "--workers", 1, "--no-page").code == 0
+    assert looked == ["0", "2", "4"]
 
 
 def test_another_scale_is_known_to_who_reads_the_maps(depth: DepthCommand, tmp_path: Path) -> None:
