@@ -145,7 +145,7 @@ class Depth(Captured, Measuring, Prediction):
         anchors = [views.anchor for views in found.view_sets]
         heard = (
             companions(capture, mine, working_depth=depth, elsewhere=anchors)
-            if self.passes > 1 and self.views != 1
+            if self._passes > 1
             else ()
         )
         search = self._search(capture, [views.anchor for views in mine])
@@ -161,7 +161,7 @@ class Depth(Captured, Measuring, Prediction):
             heard=heard,
             search=search,
             short=found.short,
-            passes=self.passes,
+            passes=self._passes,
             threads=threads,
             progress=progress,
         )
@@ -250,7 +250,7 @@ class Depth(Captured, Measuring, Prediction):
                 "precision": self.precision,
                 "views": self.views,
                 "view_sets": view_sets_in_json(views.view_sets),
-                "passes": self.passes,
+                "passes": self._passes,
                 **self.measured_record(),
                 **{name: value for name, (value, usual) in unusual.items() if value != usual},
             },
@@ -269,6 +269,11 @@ class Depth(Captured, Measuring, Prediction):
                 "sets_short_of_views": views.short,
             },
         )
+
+    @property
+    def _passes(self) -> int:
+        """Maps that rest on one image alone hear no others."""
+        return 1 if self.views == 1 else self.passes
 
     @property
     def folder(self) -> Path:

@@ -145,6 +145,13 @@ def test_measured_depth_makes_maps_better_and_alone_completes_them(
     assert errors["alone"] < 0.5 * errors["none"]
 
 
+def test_maps_of_one_image_hear_no_others(depth: Any, scene: Path, tmp_path: Path) -> None:
+    completed = ("--sensor-depth", "sensor", "--views", 1)
+    assert depth("whole", *completed).code == 0
+    assert depth("once", "--passes", 1, *completed).code == 0
+    assert np.array_equal(maps(tmp_path / "whole"), maps(tmp_path / "once"))
+
+
 @pytest.mark.parametrize(
     ("flags", "parts"),
     [
