@@ -84,7 +84,8 @@ def lone_frames(capture: Capture, file: Path | None, anchors: Sequence[str] | No
         anchors: the frames, where no file says it; all if not given.
     """
     if file is not None:
-        anchors = [views.anchor for views in read_view_sets(sets_file(file, capture.path), capture)]
+        listed = read_view_sets(sets_file(file, capture.path), capture, allow_no_sources=True)
+        anchors = [views.anchor for views in listed]
     chosen = capture.frames if anchors is None else anchors
     return UsableViews(tuple(ViewSet(id, ()) for id in chosen), 0)
 

@@ -15,6 +15,7 @@ from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.sets_file import sets_file
+from deltas_nets.captures.usable import lone_frames
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
@@ -71,7 +72,7 @@ def test_a_set_that_names_a_lost_pose_is_an_error(make_capture: MakeCapture) -> 
 
 def test_an_anchor_may_stand_alone_with_sensor_depth(capture: Capture, tmp_path: Path) -> None:
     path = write_view_sets(tmp_path, [{"anchor": 1, "sources": []}])
-    assert read_view_sets(path, capture, allow_no_sources=True) == (ViewSet("1", ()),)
+    assert lone_frames(capture, path, None).view_sets == (ViewSet("1", ()),)
 
 
 def test_frames_that_sets_name_are_checked_and_others_are_not(make_capture: MakeCapture) -> None:
