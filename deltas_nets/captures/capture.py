@@ -60,7 +60,8 @@ class Capture:
     points: SparsePoints | None = None
     """What the program that found the poses triangulated, if it says so."""
     sources: Mapping[str, tuple[str, ...]] | None = None
-    """Ids of the views that the capture's program puts to each frame, best first."""
+    """Ids of the views that the capture's program puts to each frame, best first; empty for those
+    that are to have no map. Of frames that are not there it says nothing."""
     depth_ranges: FloatArray | None = None
     """``(F, 2)`` nearest and farthest depth of each frame, if its program states them."""
 

@@ -91,8 +91,9 @@ def _floats(
     read: Callable[[bytes, Path], NDArray[np.float32]],
 ) -> Callable[[StoredDepth], NDArray[np.float32]]:
     def read_file(stored: StoredDepth) -> NDArray[np.float32]:
-        depth = read(_bytes(stored), stored.path) * np.float32(stored.unit)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        depth = read(_bytes(stored), stored.path)
+        known = np.isfinite(depth) & (depth > 0)
+        return np.where(known, depth, np.float32(0)) * np.float32(stored.unit)
 
     return read_file
 

@@ -125,12 +125,12 @@ class Depth(Captured, Measuring, Prediction):
         if not knows_its_scale(capture):  # then a few maps tell, before views are chosen
             with progress("first look", ROUNDS * ANCHORS) as report:
                 depth = depth_seen(predictor, capture, config, report=report)
-        wanted = keyframes(capture, working_depth=depth) if self.keyframes else None
+        few = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
-            found = lone_frames(capture, self.view_sets, wanted)
+            found = lone_frames(capture, self.view_sets, few)
         else:
             found = usable_view_sets(
-                capture, self.view_sets, self.views, working_depth=depth, anchors=wanted
+                capture, self.view_sets, self.views, working_depth=depth, anchors=few
             )
         check_all(capture, found.view_sets)
         if self.views != 1:
