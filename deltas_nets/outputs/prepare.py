@@ -64,7 +64,6 @@ def prepare_output(
     _check_no_capture(out, forbidden)
     check_writable(out)
     earlier = _earlier(out, wanted, overwrite=overwrite)
-    own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
     folder = OutputFolder(
         out,
         options=options,
@@ -76,7 +75,7 @@ def prepare_output(
             "settings": wanted,
             "anchors": list(map(id_in_json, frame_ids)),
         },
-        frames={} if overwrite or own is None else dict(own["frames"]),
+        frames={} if overwrite else _recorded(out, shard, frame_ids),
         shard=shard,
     )
     alone = shard[1] == 1
@@ -129,6 +128,15 @@ def _earlier(out: Path, wanted: Mapping[str, Any], *, overwrite: bool) -> list[d
         what = f"an earlier run had other settings ({difference(earlier[0], wanted)})"
         raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
     return earlier
+
+
+def _recorded(out: Path, shard: tuple[int, int], ids: Sequence[str]) -> dict[str, Any]:
+    """Records of a run that was stopped; of a shard's first run, those of its frames by others."""
+    own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
+    if own is not None:
+        return dict(own["frames"])
+    of_all = (read_summary(out / SUMMARY) or {}).get("frames", {})
+    return {id: of_all[id] for id in ids if id in of_all}
 
 
 def _remove_earlier(

@@ -30,6 +30,7 @@ from deltas_nets.outputs.products import (
     write_depth_png,
     write_points_ply,
 )
+from deltas_nets.outputs.summary import shard_summary
 
 SETTINGS: dict[str, Any] = {"weights": "deltas-small", "views": 3, "depth_range": (0.5, 10.0)}
 MakeCapture = Callable[..., Path]
@@ -295,6 +296,19 @@ def test_shards_share_a_folder_and_its_summary(tmp_path: Path) -> None:
         tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=["2"], overwrite=True
     )
     assert (again.is_finished("1"), again.is_finished("2")) == (True, False)
+
+
+def test_a_shard_keeps_what_a_run_of_all_frames_recorded(tmp_path: Path) -> None:
+    whole = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1", "2"])
+    for id in ("1", "2"):
+        write_frame(whole, id)
+    whole.write_summary("complete")
+    before = summary_of(tmp_path)["frames"]
+    shard = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=["1"])
+    shard.keep_frame("1")
+    shard.write_summary("complete")
+    assert summary_of(tmp_path)["frames"] == before
+    assert set(json.loads(shard_summary(tmp_path, (1, 2)).read_text())["frames"]) == {"1"}
 
 
 def test_a_shard_that_is_done_waits_for_those_that_never_ran(tmp_path: Path) -> None:
