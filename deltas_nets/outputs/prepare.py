@@ -8,7 +8,13 @@ from typing import Any
 
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.atomic_files import TEMPORARY, cannot_write, check_writable, plain
+from deltas_nets.outputs.atomic_files import (
+    TEMPORARY,
+    cannot_write,
+    check_writable,
+    plain,
+    write_json,
+)
 from deltas_nets.outputs.beside import remove_beside
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.folder import OutputFolder
@@ -85,6 +91,7 @@ def prepare_output(
         # Before the new summary: killed in between, the old one still says what made the rest.
         out.mkdir(parents=True, exist_ok=True)
         if overwrite:
+            _mark_stopped(out, shard)
             planned = _not_planned(earlier, wanted, alone=alone)
             _remove_earlier(folder, {*frame_ids, *planned}, earlier, alone=alone)
         if alone:
@@ -137,6 +144,14 @@ def _recorded(out: Path, shard: tuple[int, int], ids: Sequence[str]) -> dict[str
         return dict(own["frames"])
     of_all = (read_summary(out / SUMMARY) or {}).get("frames", {})
     return {id: of_all[id] for id in ids if id in of_all}
+
+
+def _mark_stopped(out: Path, shard: tuple[int, int]) -> None:
+    """Killed while maps are removed, the folder does not pass for complete."""
+    for path in {out / SUMMARY, shard_summary(out, shard)}:
+        summary = read_summary(path)
+        if summary is not None and summary["status"] == "complete":
+            write_json(path, summary | {"status": "stopped"})
 
 
 def _remove_earlier(

@@ -229,6 +229,22 @@ def test_overwrite_starts_again_and_spares_what_is_not_ours(tmp_path: Path) -> N
     assert summary_of(tmp_path)["frames"] == {}
 
 
+@pytest.mark.parametrize("shard", [(1, 1), (1, 2)])
+def test_a_folder_whose_maps_are_being_removed_is_not_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard: tuple[int, int]
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    folder = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"])
+    write_frame(folder, "1")
+    folder.write_summary("complete")
+    monkeypatch.setattr(output_prepare, "_remove_frames", killed)
+    with pytest.raises(KeyboardInterrupt):
+        prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"], overwrite=True, shard=shard)
+    assert summary_of(tmp_path)["status"] == "stopped"
+
+
 @pytest.mark.parametrize("name", ["notes.txt", "summary.json"])
 def test_a_folder_of_someone_else_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text('{"writer": "someone"}')
