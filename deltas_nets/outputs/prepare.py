@@ -16,7 +16,6 @@ from deltas_nets.outputs.atomic_files import (
     write_json,
 )
 from deltas_nets.outputs.beside import remove_beside
-from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.folder import OutputFolder
 from deltas_nets.outputs.journal import remove_journals
 from deltas_nets.outputs.products import PRODUCTS, OutputOptions, products_of
@@ -150,7 +149,7 @@ def _mark_stopped(out: Path, shard: tuple[int, int]) -> None:
     """Killed while maps are removed, the folder does not pass for complete."""
     for path in {out / SUMMARY, shard_summary(out, shard)}:
         summary = read_summary(path)
-        if summary is not None and summary["status"] == "complete":
+        if summary is not None and summary.get("status") == "complete":
             write_json(path, summary | {"status": "stopped"})
 
 
@@ -163,8 +162,7 @@ def _remove_earlier(
     _remove_frames(out, ids)
     if alone:
         _remove_shard_summaries(out)
-        FirstMaps.remove_all(out)
-    folder.first.remove()
+    folder.remove_first()
 
 
 def _not_planned(
