@@ -16,7 +16,14 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frame import Lens as FrameLens
 from deltas_nets.captures.images import resize_image
 
-__all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight", "straight_pixels"]
+__all__ = [
+    "StraightFrame",
+    "in_photo",
+    "photo_pixels",
+    "pixels_of_photo",
+    "straight",
+    "straight_pixels",
+]
 
 WIDEST = np.cos(np.radians(60))
 """What a lens sees farther off its axis is left out: a straight image of it would be all border."""
@@ -167,6 +174,17 @@ def photo_pixels(
     rays = pixel_rays(camera.resized(size), pixels.double().cpu())
     seen = _Seen.of(frame.photo).resized(photo_size).project(rays).pixels
     return seen.to(pixels)
+
+
+def in_photo(frame: StraightFrame, points: FloatArray) -> NDArray[np.bool_]:
+    """Which points ``(N, 3)`` of the world, in front of the camera, are in the photo's frame."""
+    pose, (height, width) = frame.cam_from_world, frame.photo.image_size
+    local = torch.from_numpy(points @ pose[:3, :3].T + pose[:3, 3])
+    pixels, valid = _Seen.of(frame.photo).resized(frame.photo.image_size).project(local)
+    x, y = pixels.unbind(dim=-1)
+    inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+    shown: NDArray[np.bool_] = (valid & inside).numpy()
+    return shown
 
 
 def straight_pixels(
