@@ -100,7 +100,6 @@ class Depth(Captured, Measuring, Prediction):
             "--weights", "--work-size", "--precision", "--device", "--workers", "--shard",
         ),
     }  # fmt: skip
-    going_on = "the same command goes on"
     checks: ClassVar = {"workers": at_least_one}
 
     def run(self) -> None:
@@ -269,6 +268,12 @@ class Depth(Captured, Measuring, Prediction):
                 "sets_short_of_views": views.short,
             },
         )
+
+    @property
+    def going_on(self) -> str:
+        """With --overwrite what is finished would be removed again."""
+        without = ", without --overwrite once maps are written" if self.overwrite else ""
+        return f"the same command goes on{without}"
 
     @property
     def _passes(self) -> int:

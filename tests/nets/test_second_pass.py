@@ -78,7 +78,8 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
         return call
 
     monkeypatch.setattr(FirstMaps, "write", stopped(keep, 4))
-    assert depth("broken", "--workers", 1).code == 130
+    said = depth("broken", "--workers", 1, "--overwrite")
+    assert said.code == 130 and "goes on, without --overwrite once maps" in said.err
     monkeypatch.setattr(FirstMaps, "write", stopped(keep, 8))
     assert depth("broken", "--workers", 1).code == 130
     first = tmp_path / "broken" / FIRST
