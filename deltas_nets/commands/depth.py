@@ -11,7 +11,7 @@ import tyro
 from deltas_nets import __version__
 from deltas_nets.commands.depth_options import asked_options, fitting_options
 from deltas_nets.commands.depth_telling import show, tell
-from deltas_nets.commands.flags import Captured, Flag, Prediction, usable_device
+from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for, usable_device
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
 from deltas_nets.commands.values import at_least_one, read_shard
@@ -283,4 +283,4 @@ class Depth(Captured, Measuring, Prediction):
     @property
     def folder(self) -> Path:
         """Where outputs go."""
-        return self.out or Path(f"{self.capture.resolve().stem}-depth")
+        return self.out or folder_for(self.capture, "depth")

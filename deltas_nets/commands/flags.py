@@ -113,6 +113,12 @@ class Captured:
         return moved
 
 
+def folder_for(capture: Path, made: str) -> Path:
+    """Where outputs go if nobody says it: ``CAPTURE-depth``, here; a file's suffix is left out."""
+    path = capture.resolve()
+    return Path(f"{path.stem if path.is_file() else path.name}-{made}")
+
+
 def sensible(config: Callable[..., T], **fields: Any) -> T:
     """A config of some flags, with nonsense refused in the config's own words.
 

@@ -8,7 +8,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.depth_telling import show_fused
-from deltas_nets.commands.flags import Flag, sensible
+from deltas_nets.commands.flags import Flag, folder_for, sensible
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import counted, progress, warn
 
@@ -80,7 +80,7 @@ class Fuse(Command):
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.scaled import in_metres
 
-        out = self.out or Path(f"{self.capture.resolve().stem}-fused")
+        out = self.out or folder_for(self.capture, "fused")
         if out.resolve() == self.capture.resolve():
             what = "the output folder is the capture itself"
             raise UserError(what, out, "name another folder with --out")

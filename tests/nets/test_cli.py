@@ -17,6 +17,7 @@ from small_capture import write_capture
 from deltas_nets import __version__, cli
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.commands.command_line import parse
+from deltas_nets.commands.depth import Depth
 from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS, DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
@@ -229,6 +230,14 @@ def test_lost_poses_are_left_out_with_one_warning(depth: DepthCommand) -> None:
     assert "frames without a usable pose are left out: 2" in result.err
     assert not (depth.out / "depth" / "2.png").exists()
     assert depth.summary()["lost_poses"] == [2]
+
+
+def test_folders_of_captures_with_dots_in_their_names_do_not_collide(tmp_path: Path) -> None:
+    for name in ("scene.1", "scene.2"):
+        (tmp_path / name).mkdir()
+        assert Depth(capture=tmp_path / name).folder == Path(f"{name}-depth")
+    (tmp_path / "frames.json").touch()
+    assert Depth(capture=tmp_path / "frames.json").folder == Path("frames-depth")
 
 
 def test_debug_shows_the_traceback(run: Run, tmp_path: Path) -> None:
