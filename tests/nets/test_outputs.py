@@ -5,6 +5,7 @@ import os
 import re
 import threading
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from hypothesis import strategies as st
 from PIL import Image
 from small_output import output_of, summary_of, write_frame
 
+from deltas_nets.commands.depth import Depth
+from deltas_nets.commands.fuse import Fuse
 from deltas_nets.errors import UserError
+from deltas_nets.fuse import FuseConfig
 from deltas_nets.outputs import prepare as output_prepare
 from deltas_nets.outputs import products
 from deltas_nets.outputs.atomic_files import write_json
@@ -30,7 +34,8 @@ from deltas_nets.outputs.products import (
     write_depth_png,
     write_points_ply,
 )
-from deltas_nets.outputs.summary import shard_summary
+from deltas_nets.outputs.summary import difference, shard_summary
+from deltas_nets.predict.depth_map import PredictConfig
 
 SETTINGS: dict[str, Any] = {"weights": "deltas-small", "views": 3, "depth_range": (0.5, 10.0)}
 MakeCapture = Callable[..., Path]
@@ -217,6 +222,15 @@ def test_other_settings_are_an_error_that_names_them(tmp_path: Path) -> None:
     assert error.value.where == tmp_path / "summary.json"
     assert "--views was 3, is 5" in error.value.what and "--overwrite" in error.value.remedy
     assert files_in(tmp_path) == before
+
+
+def test_settings_that_differ_are_named_by_options_that_exist() -> None:
+    flags = {field.name for command in (Depth, Fuse) for field in fields(command)}
+    configs = {field.name for config in (PredictConfig, FuseConfig) for field in fields(config)}
+    for name in configs | {"depth", "cameras", "frames", "sensor_depth", "precision", "passes"}:
+        said = difference({"settings": {name: 1}}, {name: 2})
+        options = re.findall(r"--([a-z-]+)", said)
+        assert all(option.replace("-", "_") in flags for option in options), said
 
 
 def test_overwrite_starts_again_and_spares_what_is_not_ours(tmp_path: Path) -> None:
