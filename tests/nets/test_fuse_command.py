@@ -176,6 +176,18 @@ def test_voxels_too_fine_are_refused_with_those_that_fit(
     check_memory(look_at(source, float(fitting)), 0.1)
 
 
+def test_voxels_of_a_cloud_that_cannot_be_counted_are_refused(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    asked = ("fuse", *maps, "--out", tmp_path / "out", "--cloud", "--voxel")
+    result = run(*asked, 1e-6)
+    assert_one_line(result, "voxels of 1e-06", "too fine")
+    assert not (tmp_path / "out").exists()
+    (fitting,) = re.findall(r"use (\S+) or more", result.err)
+    assert run(*asked, fitting).code == 0
+    assert abs(vertices_of(tmp_path / "out" / "cloud.ply")[:, 2] - 2.5).max() < 1e-3
+
+
 def test_unsure_maps_get_voxels_of_a_fiftieth_of_their_depth(maps: tuple[Path, Path]) -> None:
     for file in (maps[1] / "confidence").glob("*.png"):
         Image.fromarray(np.full_like(np.array(Image.open(file)), 30)).save(file)
