@@ -218,6 +218,9 @@ def test_the_scale_is_found_by_sensor_and_by_hand(capture: Capture, tmp_path: Pa
         file.write_text(text)
         with pytest.raises(UserError):
             scale_by_measurements(oracle, small, config, file)  # type: ignore[arg-type]
+    file.write_text("10 20 2.5")
+    with pytest.raises(UserError, match="line 1 is not ID X Y METRES"):
+        scale_by_measurements(oracle, small, config, file)  # type: ignore[arg-type]
     file.write_text("1 10 20 2.5")
     with pytest.raises(UserError, match="no depth was found"):
         scale_by_measurements(Blind(2.5), small, config, file)  # type: ignore[arg-type]
