@@ -122,6 +122,18 @@ def test_a_room_in_metres_is_searched_once_as_ever(capture: Capture) -> None:
     assert oracle.asked == [ROOM]
 
 
+def test_a_network_that_finds_no_point_is_asked_once(capture: Capture) -> None:
+    class Pointless(Oracle):
+        def depth_map(self, wanted: Wanted) -> DepthMap:
+            found = super().depth_map(wanted)
+            none = torch.zeros_like(found.keypoints.depth)
+            return found._replace(keypoints=found.keypoints._replace(depth=none))
+
+    oracle = Pointless(2.5)
+    found = Followed(replace(no_sensor(capture), metric=False))(oracle, VIEWS, PredictConfig())
+    assert len(oracle.asked) == 1 and found.piled is None
+
+
 @pytest.mark.parametrize("seen", [True, False])
 def test_sparse_points_spare_the_first_look(capture: Capture, seen: bool) -> None:
     known = with_points(replace(no_sensor(capture), metric=False), 0.3, seen=seen)
