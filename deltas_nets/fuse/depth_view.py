@@ -39,11 +39,6 @@ class DepthView(NamedTuple):
         """``(4, 4)`` float64."""
         return invert_pose(self.cam_from_world)
 
-    @property
-    def has_depth(self) -> bool:
-        """Whether any pixel has."""
-        return bool((self.depth > 0).any())
-
     def only(self, mask: Tensor) -> "DepthView":
         """The view less the depth where a mask ``(H, W)`` is False."""
         return self._replace(depth=torch.where(mask, self.depth, 0.0))
