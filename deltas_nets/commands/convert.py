@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, opened
 from deltas_nets.errors import UserError
 
 if TYPE_CHECKING:
@@ -67,14 +67,11 @@ class Convert(Command):
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
 
-        from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.ids import ids_in_words
-        from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import doubts_of_images, save_capture
         from deltas_nets.terminal import counted, progress, warn
 
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = self._in_metres(open_capture(self.capture, intrinsics=stated))
+        capture = self._in_metres(opened(self.capture, self.intrinsics))
         if self.depths is not None:
             from deltas_nets.fuse.seeds import seeds, with_maps
             from deltas_nets.fuse.sources import depth_source

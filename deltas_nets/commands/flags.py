@@ -80,14 +80,11 @@ class Captured:
 
     def opened(self, path: Path) -> "Capture":
         """The capture, in metres if --scale says how."""
-        from deltas_nets.captures.camera_words import Intrinsics
-        from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.scaled import in_metres
 
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = open_capture(path, intrinsics=stated)
+        capture = opened(path, self.intrinsics)
         if self.scale is None:
             return capture
         if capture.metric and self.scale != 1:
@@ -111,6 +108,19 @@ class Captured:
             moved = in_metres(capture, scale)
         print(f"a unit of the capture is {scale:.4g} m")
         return moved
+
+
+def opened(path: Path, intrinsics: str | None) -> "Capture":
+    """A capture whose images have the camera that ``--intrinsics`` states, if it does.
+
+    Raises:
+        UserError: there is none, or it cannot be read.
+    """
+    from deltas_nets.captures.camera_words import Intrinsics
+    from deltas_nets.captures.opening import open_capture
+
+    stated = None if intrinsics is None else Intrinsics.parse(intrinsics)
+    return open_capture(path, intrinsics=stated)
 
 
 def folder_for(capture: Path, made: str) -> Path:
