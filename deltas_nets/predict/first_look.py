@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.known_depths import points_in_view
 from deltas_nets.captures.measured import measured_by_hand
+from deltas_nets.captures.spread import spread
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image
@@ -21,9 +21,7 @@ from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Followed
 
-__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor", "spread"]
-
-Item = TypeVar("Item")
+__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor"]
 
 ANCHORS = 5
 """Frames that are looked at."""
@@ -152,9 +150,3 @@ def _some(
 ) -> tuple[ViewSet, ...]:
     chosen = spread(list(capture.frames), ANCHORS) if anchors is None else anchors
     return choose_view_sets(capture, 3, working_depth=working_depth, anchors=chosen)
-
-
-def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """So many of the items, evenly: the first and the last are among them."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items)))
-    return [items[round(place)] for place in places]
