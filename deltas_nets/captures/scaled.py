@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Camera, Frames
 from deltas_nets.errors import UserError
 
-__all__ = ["in_metres", "scaled"]
+__all__ = ["in_metres", "moved_frame", "scaled"]
 
 
 def scaled(
@@ -52,6 +52,13 @@ def in_metres(capture: Capture, unit: float) -> Capture:
     if not (np.isfinite(unit) and unit > 0):
         raise UserError("a unit must be positive", f"--scale {unit:g}", "give metres")
     return scaled(capture, unit, depth_factor=unit)
+
+
+def moved_frame(frame: Frame, factor: float) -> Frame:
+    """A frame where it stands in a world of another unit; its depth stays in the old one."""
+    if factor == 1:
+        return frame
+    return replace(frame, cam_from_world=_moved(frame.cam_from_world, factor))
 
 
 def _with_depth(camera: Camera, factor: float) -> Camera:

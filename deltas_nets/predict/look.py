@@ -8,6 +8,7 @@ import torch
 
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.measured import MeasuredDepth
+from deltas_nets.captures.scaled import moved_frame
 from deltas_nets.captures.straight import (
     StraightFrame,
     in_photo,
@@ -44,7 +45,7 @@ def look(
     unit = reach.unit
     config = replace(config, depth_range=(reach.near * unit, reach.far * unit))
     anchor, *others = map(straight, frames)
-    seen = [_in_unit(frame, unit) for frame in (anchor, *others)]
+    seen = [moved_frame(frame, unit) for frame in (anchor, *others)]
     if measured is not None:
         measured = measured._replace(depth=measured.depth * unit)
     of_straight = replace(config, size=None) if isinstance(anchor, StraightFrame) else config
@@ -64,14 +65,6 @@ def found_depths(found: DepthMap) -> FloatArray:
     """Depths ``(D,)`` of the triangulated points of a map."""
     depths: FloatArray = found.keypoints.depth.double().cpu().numpy()
     return depths[depths > 0]
-
-
-def _in_unit(frame: Frame, unit: float) -> Frame:
-    if unit == 1:
-        return frame
-    pose = frame.cam_from_world.copy()
-    pose[:3, 3] *= unit
-    return replace(frame, cam_from_world=pose)
 
 
 def _in_units_of_capture(found: DepthMap, unit: float) -> DepthMap:
