@@ -13,6 +13,7 @@ import numpy as np
 from deltas_nets.ablations.changes import FrameChange
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.scaled import moved_frame
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.network.deltas import Deltas
@@ -58,6 +59,10 @@ class Disturbed:
         """As the network."""
         self.inner.check_asked(config, capture, view_sets)
 
+    def check_measured(self) -> None:
+        """As the network."""
+        self.inner.check_measured()
+
     def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from what was made of all."""
         changed = [self.change(frame) for frame in wanted.frames]
@@ -96,7 +101,7 @@ class InUnit(Disturbed):
     """
 
     def __init__(self, inner: Predictor, factor: float, *, told: bool) -> None:
-        super().__init__(inner, lambda frame: _scaled(frame, factor))
+        super().__init__(inner, lambda frame: moved_frame(frame, factor))
         self.factor = factor
         self.told = told
 
@@ -114,9 +119,3 @@ class InUnit(Disturbed):
         keypoints = found.keypoints._replace(depth=found.keypoints.depth / self.factor)
         depth = (found.depth / self.factor).astype(np.float32)
         return found._replace(depth=depth, keypoints=keypoints)
-
-
-def _scaled(frame: Frame, factor: float) -> Frame:
-    pose = frame.cam_from_world.copy()
-    pose[:3, 3] *= factor
-    return replace(frame, cam_from_world=pose)

@@ -47,7 +47,7 @@ class Measurement:
                 "series": series.name,
                 "step": step.name,
                 "network": network,
-                "capture": self.capture.path.name,
+                "capture": [self.capture.path.name, self.capture.fingerprint()],
                 "view_sets": [[views.anchor, *views.sources] for views in self.view_sets],
                 "predict": vars(self.predict),
                 "search": step.search,

@@ -55,10 +55,13 @@ class Capture:
     """Whether its unit is the metre; structure from motion alone does not know it."""
     scaled_by: float = 1.0
     """What its poses and points were multiplied with after they were read."""
+    depth_scaled_by: float = 1.0
+    """The same of its sensor depth, which is in metres already where that told the scale."""
     points: SparsePoints | None = None
     """What the program that found the poses triangulated, if it says so."""
     sources: Mapping[str, tuple[str, ...]] | None = None
-    """Ids of the views that the capture's program puts to each frame, best first."""
+    """Ids of the views that the capture's program puts to each frame, best first; empty for those
+    that are to have no map. Of frames that are not there it says nothing."""
     depth_ranges: FloatArray | None = None
     """``(F, 2)`` nearest and farthest depth of each frame, if its program states them."""
 

@@ -1,6 +1,6 @@
 """Frames that help other frames' maps, and have none of their own: theirs are heard too."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -13,7 +13,11 @@ __all__ = ["companions"]
 
 
 def companions(
-    capture: Capture, view_sets: Sequence[ViewSet], *, working_depth: float | None = None
+    capture: Capture,
+    view_sets: Sequence[ViewSet],
+    *,
+    working_depth: float | None = None,
+    elsewhere: Collection[str] = (),
 ) -> tuple[ViewSet, ...]:
     """View sets of the sources that are no anchors, of no other frames than these sets name.
 
@@ -21,8 +25,9 @@ def companions(
         capture: the frames.
         view_sets: whose maps are wanted.
         working_depth: as for `deltas_nets.captures.view_choice.choose_view_sets`.
+        elsewhere: frames whose maps another run makes, which have no set either.
     """
-    anchors = {views.anchor for views in view_sets}
+    anchors = {*elsewhere, *(views.anchor for views in view_sets)}
     named = named_frames(view_sets)
     wanted = [id for id in capture.frames if id in named and id not in anchors]
     if not wanted:

@@ -14,12 +14,14 @@ from deltas_nets.captures.images import Header, Span, decode, header_of, header_
 from deltas_nets.captures.images import open_span as open_span
 from deltas_nets.errors import UserError
 
-__all__ = ["DEPTH_FORMATS", "MILLIMETRES", "DepthFormat", "StoredDepth", "depth_format"]
+__all__ = ["DEPTH_FORMATS", "FLOATS", "MILLIMETRES", "DepthFormat", "StoredDepth", "depth_format"]
 
 MILLIMETRES = 1000.0
 """Steps in a metre."""
 UNKNOWN_DEPTH = 65535
 """7-Scenes and some headsets write this for "no depth", beside 0."""
+FLOATS = (".npy", ".pfm", ".exr")
+"""Suffixes of files of floats."""
 FILE_LIMIT = 2**30
 """Bytes of a file of floats."""
 
@@ -32,12 +34,14 @@ class StoredDepth(NamedTuple):
         span: which bytes of it are the depth; None for all.
         scale: steps in a metre, where whole numbers are stored.
         size: (height, width); None where the file alone says it.
+        unit: metres in a unit of it, where floats are stored.
     """
 
     path: Path
     span: Span | None
     scale: float
     size: tuple[int, int] | None
+    unit: float = 1.0
 
 
 class DepthFormat(NamedTuple):
@@ -88,7 +92,8 @@ def _floats(
 ) -> Callable[[StoredDepth], NDArray[np.float32]]:
     def read_file(stored: StoredDepth) -> NDArray[np.float32]:
         depth = read(_bytes(stored), stored.path)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        known = np.isfinite(depth) & (depth > 0)
+        return np.where(known, depth, np.float32(0)) * np.float32(stored.unit)
 
     return read_file
 

@@ -62,6 +62,8 @@ class Frame:
     `deltas_nets.captures.register.register_depth` moves depth to the colour image."""
     depth_scale: float = MILLIMETRES
     """Steps of the depth image in a metre, where it holds whole numbers."""
+    depth_unit: float = 1.0
+    """Metres in a unit of the depth image, where it holds floats."""
     lens: Lens | None = None
     """None where straight lines are straight."""
     image_span: Span | None = None
@@ -156,7 +158,8 @@ class Frame:
         return self.depth_path
 
     def _stored_depth(self, path: Path) -> StoredDepth:
-        return StoredDepth(path, self.depth_span, self.depth_scale, self.depth_size)
+        size, unit = self.depth_size, self.depth_unit
+        return StoredDepth(path, self.depth_span, self.depth_scale, size, unit)
 
     def _check_depth_size(self, size: tuple[int, int]) -> None:
         if self.depth_size not in (None, size):

@@ -27,6 +27,7 @@ class Camera(NamedTuple):
     lens: Lens | None
     depth_scale: float = MILLIMETRES
     cam_from_depth: FloatArray | None = None
+    depth_unit: float = 1.0
 
 
 class FrameArrays(NamedTuple):
@@ -92,6 +93,7 @@ class Frames(Mapping[str, Frame]):
                 frame.lens,
                 frame.depth_scale,
                 frame.cam_from_depth,
+                frame.depth_unit,
             )
             key = tuple(_hashable(part) for part in camera)
             if key not in cameras:
@@ -164,6 +166,7 @@ class Frames(Mapping[str, Frame]):
             depth_K=camera.depth_K,
             depth_size=camera.depth_size,
             depth_scale=camera.depth_scale,
+            depth_unit=camera.depth_unit,
             cam_from_depth=camera.cam_from_depth,
             lens=camera.lens,
             image_span=_span(arrays.image_spans, position),

@@ -135,10 +135,11 @@ def measured_by_hand(file: Path, capture: Capture) -> dict[str, FloatArray]:
     found: dict[str, list[list[float]]] = {}
     for number, words in read_lines(file, name="file of measured depths", remedy=FORM):
         try:
-            # From the right: ids of frames may have spaces.
-            id, (x, y, metres) = " ".join(words[:-3]), (float(word) for word in words[-3:])
+            # From the right: ids of frames may have spaces, and have a word or more.
+            (first, *more), (x, y, metres) = words[:-3], (float(word) for word in words[-3:])
         except ValueError as error:
             raise UserError(f"line {number} is not ID X Y METRES", file, FORM) from error
+        id = " ".join([first, *more])
         height, width = capture.frame(id).image_size
         if not 0 < metres < math.inf:
             raise UserError(f"line {number}: {metres:g} m is no depth", file, FORM)

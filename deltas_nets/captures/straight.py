@@ -16,7 +16,15 @@ from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frame import Lens as FrameLens
 from deltas_nets.captures.images import resize_image
 
-__all__ = ["StraightFrame", "photo_pixels", "pixels_of_photo", "straight", "straight_pixels"]
+__all__ = [
+    "StraightFrame",
+    "in_photo",
+    "lens_of",
+    "photo_pixels",
+    "pixels_of_photo",
+    "straight",
+    "straight_pixels",
+]
 
 WIDEST = np.cos(np.radians(60))
 """What a lens sees farther off its axis is left out: a straight image of it would be all border."""
@@ -123,6 +131,11 @@ def _places(seen: _Seen, camera: _Straight, size: tuple[int, int]) -> NDArray[np
     return torch.where(inside, row * width + column, -1).reshape(size).numpy()
 
 
+def lens_of(photo: Frame) -> Lens:
+    """The lens of a photo that has one, at its own size."""
+    return _Seen.of(photo).resized(photo.image_size)
+
+
 def straight(frame: Frame) -> Frame:
     """The frame itself where straight lines are straight in it, else a `StraightFrame`."""
     if frame.lens is None:
@@ -137,7 +150,7 @@ def _straight_camera(photo: Frame) -> tuple[FloatArray, tuple[int, int]]:
     height, width = photo.image_size
     rows, columns = np.mgrid[0 : 1 : _ACROSS * 1j, 0 : 1 : _ACROSS * 1j].reshape(2, -1)
     pixels = np.stack([columns * width - 0.5, rows * height - 0.5], axis=-1)
-    seen = _Seen.of(photo).resized(photo.image_size).unproject(torch.from_numpy(pixels))
+    seen = lens_of(photo).unproject(torch.from_numpy(pixels))
     rays = seen.rays[seen.valid & (seen.rays[:, 2] > WIDEST)].numpy()
     slopes = rays[:, :2] / rays[:, 2:]
     low, high = slopes.min(axis=0), slopes.max(axis=0)
@@ -169,11 +182,22 @@ def photo_pixels(
     return seen.to(pixels)
 
 
+def in_photo(frame: StraightFrame, points: FloatArray) -> NDArray[np.bool_]:
+    """Which points ``(N, 3)`` of the world, in front of the camera, are in the photo's frame."""
+    pose, (height, width) = frame.cam_from_world, frame.photo.image_size
+    local = torch.from_numpy(points @ pose[:3, :3].T + pose[:3, 3])
+    pixels, valid = lens_of(frame.photo).project(local)
+    x, y = pixels.unbind(dim=-1)
+    inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+    shown: NDArray[np.bool_] = (valid & inside).numpy()
+    return shown
+
+
 def straight_pixels(
     frame: StraightFrame, pixels: torch.Tensor
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Where pixels ``(N, 2)`` of the photo are in the straight image, and which it shows."""
-    rays, valid = _Seen.of(frame.photo).resized(frame.photo.image_size).unproject(pixels.double())
+    rays, valid = lens_of(frame.photo).unproject(pixels.double())
     ahead = valid & (rays[:, 2] > 0)
     x, y, w = (torch.where(ahead[:, None], rays, 1.0) @ torch.from_numpy(frame.K).mT).T
     found = torch.stack([x / w, y / w], dim=-1)

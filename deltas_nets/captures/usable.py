@@ -1,6 +1,6 @@
 """Which view sets of a capture can be used, checked before anything is computed or written."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,11 +57,8 @@ def usable_view_sets(
         view_sets = read_view_sets(sets_file(file, capture.path), capture)
         wanted = num_views or 2
     elif capture.sources is not None:
-        chosen = capture.frames if anchors is None else anchors
-        known = {
-            id: [s for s in capture.sources.get(id, ()) if s in capture.frames] for id in chosen
-        }
-        view_sets = tuple(ViewSet(id, tuple(sources)) for id, sources in known.items() if sources)
+        chosen = tuple(capture.frames) if anchors is None else anchors
+        view_sets = _stated(capture, capture.sources, chosen, wanted, working_depth)
     else:
         found = choose_views(capture, wanted, working_depth=working_depth, anchors=anchors)
         view_sets = found.view_sets
@@ -84,9 +81,32 @@ def lone_frames(capture: Capture, file: Path | None, anchors: Sequence[str] | No
         anchors: the frames, where no file says it; all if not given.
     """
     if file is not None:
-        anchors = [views.anchor for views in read_view_sets(sets_file(file, capture.path), capture)]
+        listed = read_view_sets(sets_file(file, capture.path), capture, allow_no_sources=True)
+        anchors = [views.anchor for views in listed]
     chosen = capture.frames if anchors is None else anchors
     return UsableViews(tuple(ViewSet(id, ()) for id in chosen), 0)
+
+
+def _stated(
+    capture: Capture,
+    sources: Mapping[str, tuple[str, ...]],
+    anchors: Sequence[str],
+    num_views: int,
+    working_depth: float | None,
+) -> tuple[ViewSet, ...]:
+    """The capture's own view sets, and chosen ones of frames of which it says nothing."""
+    known = {id: tuple(filter(capture.frames.__contains__, sources.get(id, ()))) for id in anchors}
+    silent = [id for id in anchors if not known[id] and sources.get(id) != ()]
+    if silent:
+        ids = ids_in_words(silent)
+        warn(f"views are chosen where the capture states none that are there: {ids}")
+        found = choose_views(capture, num_views, working_depth=working_depth, anchors=silent)
+        _tell_of_short(found, num_views)
+        known |= {views.anchor: views.sources for views in found.view_sets}
+    if not any(known.values()):
+        what = "the capture says of every frame that no view goes with it"
+        raise UserError(what, capture.path, "name views with --view-sets")
+    return tuple(ViewSet(id, sources) for id, sources in known.items() if sources)
 
 
 def _tell_of_short(found: ChosenViews, wanted: int) -> None:

@@ -78,12 +78,10 @@ def anchor_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> Pose
     return PosedViews(torch.stack(intrinsics).float(), torch.stack(poses).float())
 
 
-def fit_work_size(
-    image_size: tuple[int, int], *, max_pixels: int = 240 * 320, multiple: int = MULTIPLE
-) -> tuple[int, int]:
+def fit_work_size(image_size: tuple[int, int], *, max_pixels: int = 240 * 320) -> tuple[int, int]:
     """The size to work at: the aspect ratio of the image, at most so many pixels.
 
-    Both sides are multiples of ``multiple``; among those that fit the one that keeps the
+    Both sides are multiples of ``MULTIPLE``; among those that fit the one that keeps the
     aspect ratio best for its area. Images are never enlarged, except to one multiple.
 
     Example:
@@ -93,12 +91,12 @@ def fit_work_size(
         (224, 336)
     """
     height, width = image_size
-    if height < 1 or width < 1 or max_pixels < multiple * multiple:
-        raise ValueError(f"no size with {multiple=} fits {image_size=}, {max_pixels=}")
+    if height < 1 or width < 1 or max_pixels < MULTIPLE * MULTIPLE:
+        raise ValueError(f"no size with multiples of {MULTIPLE} fits {image_size=}, {max_pixels=}")
     scale = min(1.0, (max_pixels / (height * width)) ** 0.5)
     best: tuple[float, tuple[int, int]] | None = None
-    for rows in _multiples_around(height * scale, multiple):
-        for columns in _multiples_around(width * scale, multiple):
+    for rows in _multiples_around(height * scale):
+        for columns in _multiples_around(width * scale):
             if rows * columns > max_pixels:
                 continue
             stretch = abs(np.log(rows / columns * width / height))
@@ -108,8 +106,8 @@ def fit_work_size(
             if best is None or cost < best[0]:
                 best = (cost, (rows, columns))
     if best is None:  # an image so long and thin that one multiple across is already too much
-        longest = max_pixels // multiple // multiple * multiple
-        return (multiple, longest) if width > height else (longest, multiple)
+        longest = max_pixels // MULTIPLE // MULTIPLE * MULTIPLE
+        return (MULTIPLE, longest) if width > height else (longest, MULTIPLE)
     return best[1]
 
 
@@ -169,6 +167,6 @@ def _rigid_inverse(cam_from_world: FloatArray) -> FloatArray:
     return inverse
 
 
-def _multiples_around(length: float, multiple: int) -> tuple[int, ...]:
-    below = max(1, int(length // multiple))
-    return tuple(multiple * count for count in (below - 1, below, below + 1) if count > 0)
+def _multiples_around(length: float) -> tuple[int, ...]:
+    below = max(1, int(length // MULTIPLE))
+    return tuple(MULTIPLE * count for count in (below - 1, below, below + 1) if count > 0)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, opened
 
 MOST_THREADS = 4
 
@@ -55,8 +55,6 @@ class Check(Command):
 
         import torch
 
-        from deltas_nets.captures.camera_words import Intrinsics
-        from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import save_capture
         from deltas_nets.check.matched import GROUPS
         from deltas_nets.check.refused import refused
@@ -74,11 +72,10 @@ class Check(Command):
         # Frames are small: threads that share one wait for each other, those with their own do not.
         threads = min(MOST_THREADS, torch.get_num_threads())
         torch.set_num_threads(1)
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
         found: list[Finding] = []
         capture: Capture | None = None
         try:
-            capture = open_capture(self.capture, intrinsics=stated)
+            capture = opened(self.capture, self.intrinsics)
         except UserError as error:
             finding, capture = refused(self.capture, error)
             found = [finding]

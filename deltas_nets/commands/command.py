@@ -11,13 +11,16 @@ class Command:
 
     debug: bool
     """Whether an error shows its traceback."""
-    going_on: ClassVar[str] = "start it again"
-    """What to do after the command was stopped."""
     checks: ClassVar[Mapping[str, Callable[[Any, str], object]]] = {}
     """Of values of its own flags, by name: see `deltas_nets.commands.values`."""
 
     groups: ClassVar[Mapping[str, Sequence[str]]] = {}
     """Options by title, as the help shows them; all in one where there are none."""
+
+    @property
+    def going_on(self) -> str:
+        """What to do after the command was stopped."""
+        return "start it again"
 
     @classmethod
     def parsed_as(cls, arguments: Sequence[str]) -> Any:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, opened
 from deltas_nets.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ class Convert(Command):
     images: Literal["copy", "link"] = "copy"
     """Copy images and depth, or link to where they are."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Length of the capture's unit, if you know it: what is written is in metres then."""
+    """Length of the capture's unit, if you know it, and of its depth files': what is written is in
+    metres then."""
     scale_from: Annotated[Path | None, tyro.conf.arg(metavar="sensor|FILE")] = None
     """Find that length by its sensor depth, which is in metres, or by a file of measured depths:
     lines ID X Y METRES."""
@@ -66,14 +67,13 @@ class Convert(Command):
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
 
-        from deltas_nets.captures.camera_words import Intrinsics
         from deltas_nets.captures.ids import ids_in_words
-        from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.saving import doubts_of_images, save_capture
+        from deltas_nets.captures.scaled import in_metres, scaled
         from deltas_nets.terminal import counted, progress, warn
 
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = self._in_metres(open_capture(self.capture, intrinsics=stated))
+        capture = opened(self.capture, self.intrinsics)
+        unit = self._unit(capture)
         if self.depths is not None:
             from deltas_nets.fuse.seeds import seeds, with_maps
             from deltas_nets.fuse.sources import depth_source
@@ -83,6 +83,11 @@ class Convert(Command):
                 found = seeds(source, self.points or POINTS, report=report)
             capture = replace(with_maps(source.capture, self.depths), points=found)
             print(f"{len(found.xyz)} points that two maps or more agree on")
+        if unit is not None:
+            # Maps may be in metres already; and what a sensor tells the unit by is.
+            change = unit / capture.scaled_by
+            by_sensor = self.depths is None and str(self.scale_from) == "sensor"
+            capture = scaled(capture, change) if by_sensor else in_metres(capture, change)
         with progress("writing", len(capture.frames)) as report:
             left_out = save_capture(capture, self.out, self.to, placing=self.images, report=report)
         for doubt in (*capture.doubts, *left_out, *doubts_of_images(capture)):
@@ -93,15 +98,10 @@ class Convert(Command):
         read_as = f", read as {capture.layout}," if capture.layout else ""
         print(f"{frames}{read_as} written to {self.out} as {self.to}")
 
-    def _in_metres(self, capture: "Capture") -> "Capture":
-        """The capture in metres if a flag says how, else as it is."""
-        from deltas_nets.captures.in_metres import in_metres
-        from deltas_nets.captures.scaled import scaled
-
-        if self.scale is not None:
-            return in_metres(capture, self.scale)
+    def _unit(self, capture: "Capture") -> float | None:
+        """Metres in a unit of the capture, if a flag says how to know."""
         if self.scale_from is None:
-            return capture
+            return self.scale
         from deltas_nets.predict.depth_map import PredictConfig
         from deltas_nets.predict.first_look import scale_by_measurements, scale_by_sensor
         from deltas_nets.predict.predictor import load_predictor
@@ -109,9 +109,7 @@ class Convert(Command):
         predictor, config = load_predictor("deltas-small"), PredictConfig()
         if str(self.scale_from) == "sensor":
             unit = scale_by_sensor(predictor, capture, config)
-            moved = scaled(capture, unit)  # depth files are in metres already
         else:
             unit = scale_by_measurements(predictor, capture, config, self.scale_from)
-            moved = in_metres(capture, unit)
         print(f"a unit of the capture is {unit:.4g} m")
-        return moved
+        return unit

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from deltas_nets import __version__
+from deltas_nets.commands.depth_options import asked_options, fitting_options
 from deltas_nets.commands.depth_telling import show, tell
-from deltas_nets.commands.flags import Captured, Flag, Prediction, sensible, usable_device
+from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for, usable_device
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
 from deltas_nets.commands.values import at_least_one, read_shard
 from deltas_nets.config import to_dict
-from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
@@ -81,8 +81,8 @@ class Depth(Captured, Measuring, Prediction):
     page: bool = True
     """Also write index.html to look at, contact_sheet.jpg and preview/ID.jpg."""
     shard: str = "1/1"
-    """I/N: this run does every N-th frame from the I-th, for N runs at once; in the second pass it
-    hears its own frames alone."""
+    """I/N: this run does every N-th frame from the I-th, for N runs at once; in later passes it
+    hears no map that another run writes."""
     overwrite: Flag = False
     """Start again instead of continuing, or write into a folder that holds other things."""
 
@@ -100,7 +100,6 @@ class Depth(Captured, Measuring, Prediction):
             "--weights", "--work-size", "--precision", "--device", "--workers", "--shard",
         ),
     }  # fmt: skip
-    going_on = "the same command goes on"
     checks: ClassVar = {"workers": at_least_one}
 
     def run(self) -> None:
@@ -115,20 +114,22 @@ class Depth(Captured, Measuring, Prediction):
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
-        options = self._options()
+        options = asked_options(self.depth_scale, self.format)
         capture = self.opened(self.capture).remembering()
         predictor = self.predictor()
+        if self.sensor_depth is not None:
+            predictor.check_measured()
         capture = self.in_metres(capture, predictor, config)
         depth = None
         if not knows_its_scale(capture):  # then a few maps tell, before views are chosen
             with progress("first look", ROUNDS * ANCHORS) as report:
                 depth = depth_seen(predictor, capture, config, report=report)
-        anchors = keyframes(capture, working_depth=depth) if self.keyframes else None
+        few = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
-            found = lone_frames(capture, self.view_sets, anchors)
+            found = lone_frames(capture, self.view_sets, few)
         else:
             found = usable_view_sets(
-                capture, self.view_sets, self.views, working_depth=depth, anchors=anchors
+                capture, self.view_sets, self.views, working_depth=depth, anchors=few
             )
         check_all(capture, found.view_sets)
         if self.views != 1:
@@ -136,12 +137,16 @@ class Depth(Captured, Measuring, Prediction):
         for finding in quick_findings(capture):
             if finding.cause not in TOLD_BEFORE:
                 warn(f"{finding.cause.value} ({finding.evidence}): {finding.cure}")
-        options = self._fitting(options, capture, depth)
+        options = fitting_options(options, capture, depth, self.depth_scale, self.depth_range)
         options = replace(options, confidence=predictor.states_confidence)
         predictor.check_asked(config, capture, found.view_sets)
         mine = found.view_sets[shard[0] - 1 :: shard[1]]
-        twice = self.passes > 1 and self.views != 1
-        heard = companions(capture, mine, working_depth=depth) if twice else ()
+        anchors = [views.anchor for views in found.view_sets]
+        heard = (
+            companions(capture, mine, working_depth=depth, elsewhere=anchors)
+            if self._passes > 1
+            else ()
+        )
         search = self._search(capture, [views.anchor for views in mine])
         threads = self._threads(len(mine))
         config = self._sized(config, predictor, capture, found.view_sets, search, threads)
@@ -155,7 +160,7 @@ class Depth(Captured, Measuring, Prediction):
             heard=heard,
             search=search,
             short=found.short,
-            passes=self.passes,
+            passes=self._passes,
             threads=threads,
             progress=progress,
         )
@@ -213,32 +218,6 @@ class Depth(Captured, Measuring, Prediction):
             print(f"{count} maps at a time, a core each (--workers)")
         return count
 
-    def _options(self) -> "OutputOptions":
-        from deltas_nets.outputs.products import OutputOptions
-
-        if self.depth_scale is not None and self.format != "png":
-            what = f"depth is written as float32 in {self.format}"
-            raise UserError(what, "--depth-scale", "leave it out")
-        given = {} if self.depth_scale is None else {"depth_scale": self.depth_scale}
-        return sensible(OutputOptions, depth_format=self.format, **given)
-
-    def _fitting(
-        self, options: "OutputOptions", capture: "Capture", depth: float | None
-    ) -> "OutputOptions":
-        """The options with the capture's unit, and steps that are fine and reach far enough."""
-        from deltas_nets.captures.known_depths import farthest_depth
-        from deltas_nets.captures.working_depth import working_depths
-        from deltas_nets.outputs.products import OWN_UNIT, check_depth_fits, steps_to
-
-        far = self.depth_range[1] if self.depth_range else farthest_depth(capture)
-        if not capture.metric:
-            options = replace(options, unit=OWN_UNIT)
-            usual = float(working_depths(capture).max()) if depth is None else depth
-            if self.depth_scale is None:
-                return replace(options, depth_scale=steps_to(max(far, 4 * usual)))
-        check_depth_fits((0.0, far), options)
-        return options
-
     def _folder(
         self,
         capture: "Capture",
@@ -270,7 +249,7 @@ class Depth(Captured, Measuring, Prediction):
                 "precision": self.precision,
                 "views": self.views,
                 "view_sets": view_sets_in_json(views.view_sets),
-                "passes": self.passes,
+                "passes": self._passes,
                 **self.measured_record(),
                 **{name: value for name, (value, usual) in unusual.items() if value != usual},
             },
@@ -284,12 +263,24 @@ class Depth(Captured, Measuring, Prediction):
                 "layout": capture.layout,
                 "unit": options.unit,
                 "scaled_by": capture.scaled_by,
+                "depth_scaled_by": capture.depth_scaled_by,
                 "lost_poses": list(map(id_in_json, capture.lost)),
                 "sets_short_of_views": views.short,
             },
         )
 
     @property
+    def going_on(self) -> str:
+        """With --overwrite what is finished would be removed again."""
+        without = ", without --overwrite once maps are written" if self.overwrite else ""
+        return f"the same command goes on{without}"
+
+    @property
+    def _passes(self) -> int:
+        """Maps that rest on one image alone hear no others."""
+        return 1 if self.views == 1 else self.passes
+
+    @property
     def folder(self) -> Path:
         """Where outputs go."""
-        return self.out or Path(f"{self.capture.resolve().stem}-depth")
+        return self.out or folder_for(self.capture, "depth")

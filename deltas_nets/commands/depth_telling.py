@@ -23,7 +23,7 @@ def tell(outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions", f
         steps = f", {options.depth_scale:g} steps of a PNG in it" if format == "png" else ""
         print(f"depth is in {options.unit}{steps}; --scale METRES makes it metric")
     if not options.confidence:
-        print("no confidence is written: the reference network states none")
+        print("no confidence is written: what --weights names states none")
     if outcome.blind:
         maps = counted(outcome.blind, "map")
         warn(f"a guess where no point was triangulated: {maps}, see summary.json")

@@ -1,6 +1,5 @@
 """Flags that several commands share."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,43 +73,60 @@ class Captured:
     """Of all images, whatever the capture says: "fx fy cx cy", then k1 k2 p1 p2 k3 of a lens as
     OpenCV orders them, or freiburg1, 2, 3 of TUM RGB-D."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Metres in a unit of the capture; 1 says that it is in metres."""
+    """Metres in a unit of the capture, of its depth files too; 1 says that it is in metres."""
     scale_from: Annotated[Path | None, tyro.conf.arg(metavar="sensor|FILE")] = None
-    """Make it metric by its sensor depth, or by a file of measured depths: lines ID X Y METRES."""
+    """Make it metric by its sensor depth, which is in metres then, or by a file of measured depths:
+    lines ID X Y METRES."""
 
     def opened(self, path: Path) -> "Capture":
         """The capture, in metres if --scale says how."""
-        from deltas_nets.captures.camera_words import Intrinsics
-        from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.scaled import scaled
+        from deltas_nets.captures.scaled import in_metres
 
-        if self.scale is not None and not 0 < self.scale < math.inf:
-            raise UserError("no scale", f"--scale {self.scale:g}", "give a positive number")
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = open_capture(path, intrinsics=stated)
+        capture = opened(path, self.intrinsics)
         if self.scale is None:
             return capture
         if capture.metric and self.scale != 1:
             warn(f"the capture is in metres already; --scale {self.scale:g} makes it another size")
-        return scaled(capture, self.scale)
+        return in_metres(capture, self.scale)
 
     def in_metres(
         self, capture: "Capture", predictor: "Predictor", config: "PredictConfig"
     ) -> "Capture":
         """The capture in metres if --scale-from says how, else as it is."""
-        from deltas_nets.captures.scaled import scaled
+        from deltas_nets.captures.scaled import in_metres, scaled
         from deltas_nets.predict.first_look import scale_by_measurements, scale_by_sensor
 
         if self.scale_from is None:
             return capture
         if str(self.scale_from) == "sensor":
             scale = scale_by_sensor(predictor, capture, config)
+            moved = scaled(capture, scale)  # depth files are in metres already
         else:
             scale = scale_by_measurements(predictor, capture, config, self.scale_from)
+            moved = in_metres(capture, scale)
         print(f"a unit of the capture is {scale:.4g} m")
-        return scaled(capture, scale)
+        return moved
+
+
+def opened(path: Path, intrinsics: str | None) -> "Capture":
+    """A capture whose images have the camera that ``--intrinsics`` states, if it does.
+
+    Raises:
+        UserError: there is none, or it cannot be read.
+    """
+    from deltas_nets.captures.camera_words import Intrinsics
+    from deltas_nets.captures.opening import open_capture
+
+    stated = None if intrinsics is None else Intrinsics.parse(intrinsics)
+    return open_capture(path, intrinsics=stated)
+
+
+def folder_for(capture: Path, made: str) -> Path:
+    """Where outputs go if nobody says it: ``CAPTURE-depth``, here; a file's suffix is left out."""
+    path = capture.resolve()
+    return Path(f"{path.stem if path.is_file() else path.name}-{made}")
 
 
 def sensible(config: Callable[..., T], **fields: Any) -> T:

@@ -8,7 +8,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.depth_telling import show_fused
-from deltas_nets.commands.flags import Flag, sensible
+from deltas_nets.commands.flags import Flag, folder_for, opened, sensible
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import counted, progress, warn
 
@@ -76,20 +76,16 @@ class Fuse(Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.captures.camera_words import Intrinsics
-        from deltas_nets.captures.opening import open_capture
-        from deltas_nets.captures.scaled import scaled
+        from deltas_nets.captures.scaled import in_metres
 
-        out = self.out or Path(f"{self.capture.resolve().stem}-fused")
+        out = self.out or folder_for(self.capture, "fused")
         if out.resolve() == self.capture.resolve():
             what = "the output folder is the capture itself"
             raise UserError(what, out, "name another folder with --out")
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = open_capture(self.capture, intrinsics=stated)
-        if self.scale is not None:
-            if not self.scale > 0:
-                raise UserError("no scale", f"--scale {self.scale:g}", "give a positive number")
-            capture = scaled(capture, self.scale)
+        capture = opened(self.capture, self.intrinsics)
+        # Maps know theirs, to the last digit, as their cameras are known by a hash.
+        if self.scale is not None and str(self.depths) == "sensor":
+            capture = in_metres(capture, self.scale)
         self.fuse(capture, out)
         show_fused(capture, self.depths, out)
 

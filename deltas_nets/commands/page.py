@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, sensible
+from deltas_nets.commands.flags import Flag, opened, sensible
 from deltas_nets.terminal import progress
 
 
@@ -41,15 +41,12 @@ class Page(Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.captures.camera_words import Intrinsics
-        from deltas_nets.captures.opening import open_capture
         from deltas_nets.page.maps import open_maps
         from deltas_nets.page.write import write_page
         from deltas_nets.predict.depth_map import PredictConfig
 
         sensible(PredictConfig, depth_range=self.depth_range)
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        maps = open_maps(open_capture(self.capture, intrinsics=stated), self.depths, self.fused)
+        maps = open_maps(opened(self.capture, self.intrinsics), self.depths, self.fused)
         with progress("page", len(maps.ids)) as report:
             page = write_page(maps, depth_range=self.depth_range, report=report)
         print(page.line)

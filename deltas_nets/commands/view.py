@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, opened
 from deltas_nets.errors import UserError
 
 
@@ -45,16 +45,13 @@ class View(Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.captures.camera_words import Intrinsics
-        from deltas_nets.captures.opening import open_capture
         from deltas_nets.page.maps import open_maps
         from deltas_nets.view.viewer import check_extra, open_viewer
 
         check_extra()
         if not 0 < self.port < 65536:
             raise UserError("no port", f"--port {self.port}", "give 1 to 65535")
-        stated = None if self.intrinsics is None else Intrinsics.parse(self.intrinsics)
-        capture = open_capture(self.capture, intrinsics=stated)
+        capture = opened(self.capture, self.intrinsics)
         if self.fused is not None and self.depths is None:
             raise UserError("no depth maps", "--fused", "name DEPTHS, too")
         maps = None if self.depths is None else open_maps(capture, self.depths, self.fused)

@@ -5,10 +5,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ALIGNMENTS", "Aligned", "Alignment", "align"]
+__all__ = ["Aligned", "Alignment", "align"]
 
 Alignment = Literal["none", "median", "scale-and-shift"]
-ALIGNMENTS: tuple[Alignment, ...] = ("none", "median", "scale-and-shift")
 Map = NDArray[np.float32]
 
 

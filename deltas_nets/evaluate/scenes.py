@@ -3,7 +3,6 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from deltas_nets.captures.ids import ids_in_words, natural_key
 from deltas_nets.captures.opening import READERS
@@ -13,9 +12,7 @@ from deltas_nets.datasets.scene_names import choose_scenes, find_scenes
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import warn
 
-__all__ = ["DataName", "named_scenes", "scenes_in", "scenes_of_split"]
-
-DataName = Literal["scannet"]
+__all__ = ["named_scenes", "scenes_in", "scenes_of_split"]
 
 
 def named_scenes(paths: Sequence[Path], listed: Path | None = None) -> dict[str, Path]:

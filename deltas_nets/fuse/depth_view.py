@@ -9,7 +9,7 @@ from deltas_geom.cameras.pixels import pixel_grid
 from deltas_geom.cameras.poses import invert_pose
 from deltas_geom.cameras.projection import pixel_rays
 
-__all__ = ["DepthView"]
+__all__ = ["DepthView", "nearest"]
 
 
 class DepthView(NamedTuple):
@@ -39,11 +39,6 @@ class DepthView(NamedTuple):
         """``(4, 4)`` float64."""
         return invert_pose(self.cam_from_world)
 
-    @property
-    def has_depth(self) -> bool:
-        """Whether any pixel has."""
-        return bool((self.depth > 0).any())
-
     def only(self, mask: Tensor) -> "DepthView":
         """The view less the depth where a mask ``(H, W)`` is False."""
         return self._replace(depth=torch.where(mask, self.depth, 0.0))
@@ -60,3 +55,14 @@ class DepthView(NamedTuple):
     def to(self, device: str | torch.device) -> "DepthView":
         """The view on a device."""
         return DepthView(*(tensor.to(device) for tensor in self))
+
+
+def nearest(image: Tensor, pixels: Tensor) -> Tensor:
+    """An image ``(H, W, ...)`` at the nearest of its pixels ``(*B, 2)``; 0 beyond it."""
+    height, width = image.shape[:2]
+    column, row = (pixels + 0.5).floor().unbind(dim=-1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row = column.clamp(0, width - 1).long(), row.clamp(0, height - 1).long()
+    found = image[row, column]
+    inside = inside.view(*inside.shape, *(1,) * (image.ndim - 2))
+    return torch.where(inside, found, torch.zeros_like(found))

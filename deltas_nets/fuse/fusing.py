@@ -15,7 +15,7 @@ from deltas_nets.fuse.left_out import LeftOut, cure, doubt, mean_left_out
 from deltas_nets.fuse.mesh import without_small_parts
 from deltas_nets.fuse.prepared import PreparedViews
 from deltas_nets.fuse.products import FUSED, FusedName
-from deltas_nets.fuse.sizes import Sizes, check_memory, look_at
+from deltas_nets.fuse.sizes import Sizes, check_memory, check_reach, look_at
 from deltas_nets.fuse.sources import DepthSource
 from deltas_nets.fuse.state import Sums, read_state, write_state
 from deltas_nets.fuse.surface import surface
@@ -96,6 +96,7 @@ def fuse_capture(
         kinds = {FUSED[name].of for name in products}
         if "surface" in kinds:
             check_memory(sizes, gigabytes)
+        check_reach(sizes)
         sums = _sums(kinds, sizes, device, threads)
         out.mkdir(parents=True, exist_ok=True)
         head = {"writer": FUSE_WRITER, "voxel": sizes.voxel, "truncation": sizes.truncation}

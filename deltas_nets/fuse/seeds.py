@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.points import Observations, SparsePoints
+from deltas_nets.captures.straight import lens_of
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.agreement import agreement
-from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.fuse.depth_view import DepthView, nearest
 from deltas_nets.fuse.neighbours import neighbours
 from deltas_nets.fuse.sources import DepthSource
 from deltas_nets.outputs.summary import recorded_depth_scale
@@ -140,7 +140,7 @@ def _with_tracks(
     per_pixel = capture.frames.at(own).image_size[1] / view.image_size[1]
     for place, other in others:
         pixels, depth = _seen_by(other, chosen.xyz)
-        theirs = _read(other.depth, pixels)
+        theirs = nearest(other.depth, pixels).double()
         same = (depth > 0) & (theirs > 0) & ((theirs - depth).abs() < SAME * depth)
         rays = torch.cat([pixels, torch.ones(count, 1)], dim=-1).double() @ other.K.inverse().mT
         back = other.world_from_cam
@@ -177,15 +177,6 @@ def _seen_by(view: DepthView, xyz: Tensor) -> tuple[Tensor, Tensor]:
     return pixels, torch.where(ahead, found[:, 2], 0.0)
 
 
-def _read(image: Tensor, pixels: Tensor) -> Tensor:
-    """An image at the nearest pixels, float64; 0 beyond it."""
-    height, width = image.shape
-    column, row = (pixels + 0.5).floor().unbind(dim=-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    column, row = column.clamp(0, width - 1).long(), row.clamp(0, height - 1).long()
-    return torch.where(inside, image[row, column].double(), 0.0)
-
-
 def _photo_pixels(frame: Frame, xyz: FloatArray) -> FloatArray:
     """Where the photo, lens and all, shows world points ``(N, 3)`` in front of it."""
     local = xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
@@ -193,9 +184,7 @@ def _photo_pixels(frame: Frame, xyz: FloatArray) -> FloatArray:
         pixels = local @ frame.K.T
         flat: FloatArray = pixels[:, :2] / pixels[:, 2:]
         return flat
-    coefficients = torch.tensor(frame.lens.coefficients, dtype=torch.float64)
-    lens = Lens(torch.tensor(frame.K), coefficients, frame.lens.model)
-    found: FloatArray = lens.project(torch.from_numpy(local)).pixels.numpy()
+    found: FloatArray = lens_of(frame).project(torch.from_numpy(local)).pixels.numpy()
     return found
 
 

@@ -17,7 +17,7 @@ from deltas_nets.fuse.lattice import REACH, distinct_names
 from deltas_nets.fuse.sources import DepthSource
 from deltas_nets.fuse.volume import BYTES_OF_BLOCK
 
-__all__ = ["Sizes", "check_memory", "look_at"]
+__all__ = ["Sizes", "check_memory", "check_reach", "look_at"]
 
 LOOKED_AT = 16
 """Maps that tell the sizes of all."""
@@ -133,6 +133,17 @@ def check_memory(sizes: Sizes, gigabytes: float) -> None:
             "--voxel",
             f"use {_up(fits.voxel)} or more, or allow more with --memory",
         )
+
+
+def check_reach(sizes: Sizes) -> None:
+    """Whether voxels can be counted from one end of the scene to the other.
+
+    Raises:
+        UserError: they cannot; the text says with what voxels they could.
+    """
+    if sizes.extent / sizes.voxel > REACH / 2:
+        what = f"voxels of {sizes.voxel:g} are too fine for a scene of {2 * sizes.extent:.3g}"
+        raise UserError(what, "--voxel", f"use {_up(2 * sizes.extent / REACH)} or more")
 
 
 def _up(value: float) -> str:

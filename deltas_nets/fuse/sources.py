@@ -7,15 +7,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from deltas_geom import Lens
 from deltas_geom.cameras.pixels import pixel_grid, resize_intrinsics
 from deltas_geom.cameras.poses import invert_pose
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.images import header_of_whole_file
-from deltas_nets.captures.straight import StraightFrame, photo_pixels, straight
+from deltas_nets.captures.straight import StraightFrame, lens_of, photo_pixels, straight
 from deltas_nets.errors import UserError
-from deltas_nets.fuse.depth_view import DepthView
+from deltas_nets.fuse.depth_view import DepthView, nearest
 from deltas_nets.fuse.deviation import std_of_confidence, std_of_sensor
 from deltas_nets.outputs.confidence_maps import confidence_file, read_confidence
 from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
@@ -201,7 +200,7 @@ def _of_photo(frame: Frame, depth: Tensor, std: Tensor, *, most: int) -> DepthVi
     grid = pixel_grid(camera.image_size, dtype=torch.float64).view(*camera.image_size, 2)
     grid = grid[every, every]
     seen = photo_pixels(camera, grid.reshape(-1, 2), camera.image_size, size).view_as(grid)
-    depth, std = _nearest(depth, seen), _nearest(std, seen)
+    depth, std = nearest(depth, seen), nearest(std, seen)
     colors = torch.from_numpy(camera.read_image().copy())[every, every].contiguous()
     K = _thinned(torch.tensor(camera.K), step)
     return DepthView(depth, torch.where(depth > 0, std, 1.0), colors, K, pose)
@@ -228,19 +227,6 @@ def _of_own_camera(frame: Frame, depth: Tensor, std: Tensor) -> DepthView:
         z = points[..., 2:].clamp_min(1e-9)
         pixels = (points @ photo_K.T)[..., :2] / z
     else:
-        coefficients = torch.tensor(frame.lens.coefficients, dtype=torch.float64)
-        lens = Lens(photo_K, coefficients, frame.lens.model)
-        pixels = lens.project(points.reshape(-1, 3)).pixels.view(*depth.shape, 2)
+        pixels = lens_of(frame).project(points.reshape(-1, 3)).pixels.view(*depth.shape, 2)
     photo = torch.from_numpy(frame.read_image().copy())
-    return view._replace(colors=_nearest(photo, pixels))
-
-
-def _nearest(image: Tensor, pixels: Tensor) -> Tensor:
-    """An image ``(H, W, ...)`` at pixels ``(h, w, 2)``; 0 beyond it."""
-    height, width = image.shape[:2]
-    column, row = (pixels + 0.5).floor().unbind(dim=-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    column, row = column.clamp(0, width - 1).long(), row.clamp(0, height - 1).long()
-    found = image[row, column]
-    inside = inside.view(*inside.shape, *(1,) * (image.ndim - 2))
-    return torch.where(inside, found, torch.zeros_like(found))
+    return view._replace(colors=nearest(photo, pixels))

@@ -57,10 +57,6 @@ class FirstMaps:
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, lambda opened: opened.write(content))
 
-    def has(self, id: str) -> bool:
-        """Whether the map of a frame is there."""
-        return self.file(id).exists()
-
     def read(self, id: str) -> tuple[KnownDepth, dict[str, Any]] | None:
         """The map of a frame and its record; None where it is not there, or damaged."""
         try:

@@ -95,6 +95,13 @@ class OutputFolder:
             if self.is_finished(id) and (wanted is None or id in wanted):
                 self.frames[id] = record
 
+    def remove_first(self) -> None:
+        """Remove the maps of the first pass, of all runs where no other is at work."""
+        if self._shard[1] == 1:
+            FirstMaps.remove_all(self.path)
+        else:
+            self.first.remove()
+
     def write_summary(self, status: str, **more: Any) -> None:
         """Write the summary: ``running`` at the start and in between, then how it ended.
 

@@ -8,9 +8,14 @@ from typing import Any
 
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.atomic_files import TEMPORARY, cannot_write, check_writable, plain
+from deltas_nets.outputs.atomic_files import (
+    TEMPORARY,
+    cannot_write,
+    check_writable,
+    plain,
+    write_json,
+)
 from deltas_nets.outputs.beside import remove_beside
-from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.outputs.folder import OutputFolder
 from deltas_nets.outputs.journal import remove_journals
 from deltas_nets.outputs.products import PRODUCTS, OutputOptions, products_of
@@ -64,7 +69,6 @@ def prepare_output(
     _check_no_capture(out, forbidden)
     check_writable(out)
     earlier = _earlier(out, wanted, overwrite=overwrite)
-    own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
     folder = OutputFolder(
         out,
         options=options,
@@ -76,7 +80,7 @@ def prepare_output(
             "settings": wanted,
             "anchors": list(map(id_in_json, frame_ids)),
         },
-        frames={} if overwrite or own is None else dict(own["frames"]),
+        frames={} if overwrite else _recorded(out, shard, frame_ids),
         shard=shard,
     )
     alone = shard[1] == 1
@@ -86,6 +90,7 @@ def prepare_output(
         # Before the new summary: killed in between, the old one still says what made the rest.
         out.mkdir(parents=True, exist_ok=True)
         if overwrite:
+            _mark_stopped(out, shard)
             planned = _not_planned(earlier, wanted, alone=alone)
             _remove_earlier(folder, {*frame_ids, *planned}, earlier, alone=alone)
         if alone:
@@ -131,6 +136,23 @@ def _earlier(out: Path, wanted: Mapping[str, Any], *, overwrite: bool) -> list[d
     return earlier
 
 
+def _recorded(out: Path, shard: tuple[int, int], ids: Sequence[str]) -> dict[str, Any]:
+    """Records of a run that was stopped; of a shard's first run, those of its frames by others."""
+    own = read_summary(out / SUMMARY if shard[1] == 1 else shard_summary(out, shard))
+    if own is not None:
+        return dict(own["frames"])
+    of_all = (read_summary(out / SUMMARY) or {}).get("frames", {})
+    return {id: of_all[id] for id in ids if id in of_all}
+
+
+def _mark_stopped(out: Path, shard: tuple[int, int]) -> None:
+    """Killed while maps are removed, the folder does not pass for complete."""
+    for path in {out / SUMMARY, shard_summary(out, shard)}:
+        summary = read_summary(path)
+        if summary is not None and summary.get("status") == "complete":
+            write_json(path, summary | {"status": "stopped"})
+
+
 def _remove_earlier(
     folder: OutputFolder, ids: set[str], earlier: Sequence[Mapping[str, Any]], *, alone: bool
 ) -> None:
@@ -140,8 +162,7 @@ def _remove_earlier(
     _remove_frames(out, ids)
     if alone:
         _remove_shard_summaries(out)
-        FirstMaps.remove_all(out)
-    folder.first.remove()
+    folder.remove_first()
 
 
 def _not_planned(

@@ -68,6 +68,11 @@ OPTIONS = {
     "network": "--weights",
     "weights": "--weights",
     "view_sets": "--view-sets (a file's or chosen ones)",
+    "work_pixels": "the size of images that a trial found, --work-size",
+    "depth": "what made the maps",
+    "cameras": "the capture or one of its cameras",
+    "frames": "which frames have depth",
+    "deviations": "how far maps may differ",
 }
 """What states a setting; of the others an option of the same name does."""
 

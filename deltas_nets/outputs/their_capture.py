@@ -68,7 +68,8 @@ def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> 
     factor = summary.get("scaled_by", 1.0)
     if isinstance(factor, int | float) and factor > 0 and factor != capture.scaled_by:
         metric = summary.get("unit", METRE) == METRE
-        capture = scaled(capture, factor / capture.scaled_by, metric=metric)
+        depth = summary.get("depth_scaled_by", 1.0) / capture.depth_scaled_by
+        capture = scaled(capture, factor / capture.scaled_by, depth_factor=depth, metric=metric)
     recorded = summary["settings"].get("capture")
     cameras = recorded.get("cameras") if isinstance(recorded, dict) else None
     if cameras is not None and cameras != capture.fingerprint():

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from deltas_nets.page.pictures import LONGEST, spread
+from deltas_nets.captures.spread import spread
+from deltas_nets.page.pictures import LONGEST
 
 __all__ = ["MOST_BYTES", "Chosen", "choose"]
 
@@ -46,4 +47,4 @@ def choose(ids: Sequence[str], room: int, bytes_of: Callable[[str, int], int]) -
         each = MARGIN * sum(measured) / len(measured)
         if each * len(ids) <= room:
             return Chosen(tuple(ids), longest)
-    return Chosen(spread(ids, max(2, int(room / each))), longest)
+    return Chosen(tuple(spread(ids, max(2, int(room / each)))), longest)

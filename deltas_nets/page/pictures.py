@@ -1,7 +1,7 @@
 """What a frame looks like: its image, its depth, how sure that is, and how wrong."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ from PIL import Image
 
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.register import register_depth
+from deltas_nets.captures.spread import spread
 from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.evaluate.depth_metrics import DepthMetrics
 from deltas_nets.evaluate.scores import resize_nearest, score_map
@@ -24,7 +25,6 @@ __all__ = [
     "sample_of_depth",
     "scales_of",
     "size_within",
-    "spread",
 ]
 
 LONGEST = 640
@@ -64,19 +64,6 @@ def sample_of_depth(maps: Maps) -> NDArray[np.float32]:
 def scales_of(depth: Scale) -> Mapping[str, Scale]:
     """The scale of each kind of picture that has one."""
     return {"depth": depth, "confidence": CONFIDENCE, "truth": depth, "error": ERROR}
-
-
-def spread(ids: Sequence[str], count: int) -> tuple[str, ...]:
-    """At most so many ids, evenly apart, the first and the last among them.
-
-    Example:
-        >>> spread("abcdefg", 4)
-        ('a', 'c', 'e', 'g')
-    """
-    if len(ids) <= count:
-        return tuple(ids)
-    places = np.linspace(0, len(ids) - 1, count).round().astype(int)
-    return tuple(ids[place] for place in places)
 
 
 def size_within(shape: tuple[int, ...], longest: int) -> tuple[int, int]:

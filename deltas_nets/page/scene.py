@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.spread import spread
 from deltas_nets.page.maps import FUSED, Maps
-from deltas_nets.page.pictures import spread
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
 
 __all__ = [

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from deltas_nets.captures.spread import spread
 from deltas_nets.evaluate.scores import resize_nearest
 from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically
 from deltas_nets.outputs.beside import PAGE, PREVIEWS, SHEET, preview_file
@@ -15,7 +16,7 @@ from deltas_nets.page.budget import MOST_BYTES, choose
 from deltas_nets.page.colours import Scale, coloured, depth_scale, with_bar
 from deltas_nets.page.html import ShownFrame, bytes_of_frame, bytes_of_layer, html_of, shown_frame
 from deltas_nets.page.maps import Maps
-from deltas_nets.page.pictures import pictures_of, sample_of_depth, size_within, spread
+from deltas_nets.page.pictures import pictures_of, sample_of_depth, size_within
 from deltas_nets.page.scene import layers_of
 from deltas_nets.page.sheet import MOST_CELLS, cell_of, contact_sheet
 

@@ -101,7 +101,7 @@ def predict_capture(
         twice = agreeing and missing
         for record in run.agreeing(missing, seen, passes) if twice else run.alone(missing):
             outcome = outcome.and_one(record)
-        folder.first.remove()
+        folder.remove_first()
         status = "complete"
     finally:
         said = verdict(list(folder.frames.values()), short=short)

@@ -1,8 +1,8 @@
 """What a few maps tell of a whole capture: how far its surfaces are, how long its unit is."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.known_depths import points_in_view
 from deltas_nets.captures.measured import measured_by_hand
+from deltas_nets.captures.spread import spread
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image
@@ -20,9 +21,7 @@ from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Followed
 
-__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor", "spread"]
-
-Item = TypeVar("Item")
+__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor"]
 
 ANCHORS = 5
 """Frames that are looked at."""
@@ -73,6 +72,11 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
 
     It is compared with sparse points where frames see some, else with maps of a few frames.
 
+    Args:
+        predictor: of a trained network.
+        capture: the frames.
+        config: as for the maps that are written; here they are whole, and as large as the photos.
+
     Raises:
         UserError: no frame has sensor depth that can be compared.
     """
@@ -82,7 +86,7 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
     for id in spread(with_sensor, 4 * ANCHORS):
         ratios += _ratios_at_points(capture, position[id]).tolist()
     if len(ratios) < ENOUGH:
-        search = Followed(capture)
+        search, config = Followed(capture), _whole(config)
         for views in _some(capture, anchors=spread(with_sensor, ANCHORS)):
             depth = search(predictor, views, config).map.depth
             measured = depth_at_image(capture.frame(views.anchor))
@@ -102,14 +106,14 @@ def scale_by_measurements(
     Args:
         predictor: of a trained network.
         capture: the frames.
-        config: sizes; the map is as large as the photo.
+        config: as for the maps that are written; here they are whole, and as large as the photos.
         file: lines ``ID X Y METRES``: a frame, a pixel, and how far along the view what it shows
             is from the camera.
 
     Raises:
         UserError: the file is malformed, or names a frame or pixel that there is not.
     """
-    search, ratios = Followed(capture), []
+    search, config, ratios = Followed(capture), _whole(config), []
     for id, rows in measured_by_hand(file, capture).items():
         (views,) = _some(capture, anchors=[id])
         depth = search(predictor, views, config).map.depth
@@ -120,6 +124,11 @@ def scale_by_measurements(
                 raise UserError(what, file, "measure nearer to the middle of the photo")
             ratios.append(metres / found)
     return float(np.median(ratios))
+
+
+def _whole(config: PredictConfig) -> PredictConfig:
+    """For maps of the photo's own pixels, with a depth at all of them."""
+    return replace(config, size=None, min_confidence=0.0)
 
 
 def _ratios_at_points(capture: Capture, position: int) -> FloatArray:
@@ -141,9 +150,3 @@ def _some(
 ) -> tuple[ViewSet, ...]:
     chosen = spread(list(capture.frames), ANCHORS) if anchors is None else anchors
     return choose_view_sets(capture, 3, working_depth=working_depth, anchors=chosen)
-
-
-def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """So many of the items, evenly: the first and the last are among them."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items)))
-    return [items[round(place)] for place in places]

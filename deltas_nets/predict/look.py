@@ -8,7 +8,14 @@ import torch
 
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.measured import MeasuredDepth
-from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
+from deltas_nets.captures.scaled import moved_frame
+from deltas_nets.captures.straight import (
+    StraightFrame,
+    in_photo,
+    photo_pixels,
+    pixels_of_photo,
+    straight,
+)
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted, resized
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
@@ -37,17 +44,18 @@ def look(
     """
     unit = reach.unit
     config = replace(config, depth_range=(reach.near * unit, reach.far * unit))
-    seen = [_in_unit(straight(frame), unit) for frame in frames]
+    anchor, *others = map(straight, frames)
+    seen = [moved_frame(frame, unit) for frame in (anchor, *others)]
     if measured is not None:
         measured = measured._replace(depth=measured.depth * unit)
-    of_straight = replace(config, size=None) if isinstance(seen[0], StraightFrame) else config
+    of_straight = replace(config, size=None) if isinstance(anchor, StraightFrame) else config
     found = predictor.depth_map(Wanted(seen, of_straight, measured))
     found = found if unit == 1 else _in_units_of_capture(found, unit)
-    return as_photographed(found, seen[0], config)
+    return as_photographed(found, anchor, config)
 
 
 def as_photographed(found: DepthMap, anchor: Frame, config: PredictConfig) -> DepthMap:
-    """The map of a frame made straight, for the pixels of its photo."""
+    """The map of a frame made straight, for the pixels of its photo, in the unit of its pose."""
     if not isinstance(anchor, StraightFrame):
         return found
     return _through_lens(found, anchor, config.size or anchor.photo.image_size)
@@ -57,14 +65,6 @@ def found_depths(found: DepthMap) -> FloatArray:
     """Depths ``(D,)`` of the triangulated points of a map."""
     depths: FloatArray = found.keypoints.depth.double().cpu().numpy()
     return depths[depths > 0]
-
-
-def _in_unit(frame: Frame, unit: float) -> Frame:
-    if unit == 1:
-        return frame
-    pose = frame.cam_from_world.copy()
-    pose[:3, 3] *= unit
-    return replace(frame, cam_from_world=pose)
 
 
 def _in_units_of_capture(found: DepthMap, unit: float) -> DepthMap:
@@ -77,7 +77,7 @@ def _in_units_of_capture(found: DepthMap, unit: float) -> DepthMap:
 
 
 def _through_lens(found: DepthMap, anchor: StraightFrame, size: tuple[int, int]) -> DepthMap:
-    """The map of a straight image, for the pixels of the photo; 0 beyond what that shows."""
+    """The map of a straight image, for the pixels of the photo; nothing beyond what that shows."""
     place = pixels_of_photo(anchor, size)
     outside = place < 0
     depth = np.where(outside, np.float32(0), found.depth.ravel()[place])
@@ -89,9 +89,12 @@ def _through_lens(found: DepthMap, anchor: StraightFrame, size: tuple[int, int])
         log_std = torch.from_numpy(resized(log_std, anchor.image_size).ravel()[place])[None]
     keypoints = found.keypoints
     at = photo_pixels(anchor, keypoints.pixels, keypoints.image_size, size)
+    shown = in_photo(anchor, found.points)
     return found._replace(
         depth=depth,
         confidence=confidence,
+        points=found.points[shown],
+        colors=found.colors[shown],
         keypoints=keypoints._replace(pixels=at, image_size=size),
         log_std=log_std,
     )

@@ -92,6 +92,9 @@ class DeltasPredictor:
     ) -> None:
         """It can do all of it."""
 
+    def check_measured(self) -> None:
+        """It takes it."""
+
     def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them, and from what was measured."""
         frames, config, measured = wanted

@@ -50,11 +50,19 @@ class Predictor(Protocol):
             UserError: names what it cannot.
         """
 
+    def check_measured(self) -> None:
+        """Whether the network takes measured depth.
+
+        Raises:
+            UserError: it takes none.
+        """
+
     def depth_map(self, wanted: Wanted) -> DepthMap:
         """Depth of the first frame from all of them; frames seen before need not be encoded again.
 
         Args:
-            wanted: frames, and a config that asks for what it can do (:meth:`check_asked`).
+            wanted: frames, and a config that asks for what it can do (:meth:`check_asked`), as
+                measured depth does (:meth:`check_measured`).
 
         Raises:
             UserError: an image cannot be read; the network does not take measured depth, or there

@@ -149,8 +149,8 @@ def settled(
             reach, sure = wider(reach, piled), False
         elif len(depths):
             reach, sure = reach_of(depths, metric=metric), True
-        else:
-            break
+        else:  # nothing tells where to look instead
+            return Found(found, reach, None)
     found = looked(reach)
     return Found(found, reach, end_of_pile(found_depths(found), reach))
 

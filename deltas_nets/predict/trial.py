@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.spread import spread
 from deltas_nets.captures.straight import straight
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.check.workers import side_by_side
 from deltas_nets.predict.depth_map import PredictConfig
-from deltas_nets.predict.first_look import spread
 from deltas_nets.predict.ours import work_size_of
 from deltas_nets.predict.passes import SMALL
 from deltas_nets.predict.predictor import Predictor

@@ -22,6 +22,11 @@ class ViewsAlone:
         """As refusals call it."""
         raise NotImplementedError
 
+    def check_measured(self) -> None:
+        """It takes none."""
+        what = f"{self.called} takes no measured depth, and looks at two views or more"
+        raise UserError(what, "--sensor-depth", "leave it out")
+
     def refuse_measured(self, wanted: Wanted) -> None:
         """Refuse what only a network of deltas can use.
 
@@ -29,8 +34,7 @@ class ViewsAlone:
             UserError: there is measured depth, or no source.
         """
         if wanted.measured is not None or len(wanted.frames) == 1:
-            what = f"{self.called} takes no measured depth, and looks at two views or more"
-            raise UserError(what, "--sensor-depth", "leave it out")
+            self.check_measured()
 
     def refuse_confidence(self, config: PredictConfig) -> None:
         """Refuse what only a network that states a confidence can use.

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.spread import spread
 from deltas_nets.errors import UserError
 from deltas_nets.page.maps import Maps
-from deltas_nets.page.pictures import size_within, spread
+from deltas_nets.page.pictures import size_within
 from deltas_nets.page.scene import (
     SURE,
     Camera,

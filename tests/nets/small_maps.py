@@ -40,7 +40,11 @@ def write_maps(
         },
         options=options,
         frame_ids=ids,
-        head={"unit": options.unit, "scaled_by": capture.scaled_by},
+        head={
+            "unit": options.unit,
+            "scaled_by": capture.scaled_by,
+            "depth_scaled_by": capture.depth_scaled_by,
+        },
     )
     for id in ids:
         frame = capture.frame(id)

@@ -83,6 +83,7 @@ def test_evaluate_and_depth_take_a_baseline_by_name(run: Run, folder: Path, tmp_
     assert "plane-sweep" in (tmp_path / "scores.json").read_text()
     said = run("depth", folder, *flags, "--out", tmp_path / "out")
     assert said.code == 0, said.err
+    assert "no confidence is written: what --weights names states none" in said.out
     depth = read_depth_png(tmp_path / "out" / "depth" / "0.png")
     truth = depth_at_image(open_capture(folder).frame("0"))
     assert np.median(np.abs(depth / truth - 1)) < 0.1
@@ -131,6 +132,7 @@ def test_what_a_baseline_cannot_is_refused(
         "depth", folder, "--out", tmp_path / "out", "--weights", "plane-sweep", "--views", 2, *flags
     )
     assert_one_line(said, *parts)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_wrong_name_is_no_baseline(run: Run, folder: Path) -> None:

@@ -12,14 +12,18 @@ import torch
 from PIL import Image
 from run_command import Result, Run, assert_one_line
 from run_fit import HELD_OUT
+from small_capture import write_capture
 
 from deltas_nets import __version__, cli
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.commands.command_line import parse
+from deltas_nets.commands.depth import Depth
 from deltas_nets.commands.train import Train
 from deltas_nets.config import TRAIN_CONFIGS, DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs import products
 from deltas_nets.outputs.products import read_depth_png, read_points_ply
+from deltas_nets.predict.passes import Passes
 from deltas_nets.train import fit
 from deltas_nets.weights_file import save_weights
 
@@ -175,6 +179,21 @@ def test_shards_share_the_work(depth: DepthCommand) -> None:
     assert len(list((depth.out / "depth").iterdir())) == 4
 
 
+def test_a_shard_looks_at_no_frame_for_another(
+    depth: DepthCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked, see = [], Passes._see
+
+    def seen(self: Passes, views: ViewSet) -> None:
+        looked.append(views.anchor)
+        see(self, views)
+
+    monkeypatch.setattr(Passes, "_see", seen)
+    depth.capture = write_capture(depth.capture.parent / "six", 6)
+    assert depth("--shard", "1/2", "--workers", 1, "--no-page").code == 0
+    assert looked == ["0", "2", "4"]
+
+
 def test_another_scale_is_known_to_who_reads_the_maps(depth: DepthCommand, tmp_path: Path) -> None:
     errors = []
     for scale in (100, 1000):
@@ -211,6 +230,14 @@ def test_lost_poses_are_left_out_with_one_warning(depth: DepthCommand) -> None:
     assert "frames without a usable pose are left out: 2" in result.err
     assert not (depth.out / "depth" / "2.png").exists()
     assert depth.summary()["lost_poses"] == [2]
+
+
+def test_folders_of_captures_with_dots_in_their_names_do_not_collide(tmp_path: Path) -> None:
+    for name in ("scene.1", "scene.2"):
+        (tmp_path / name).mkdir()
+        assert Depth(capture=tmp_path / name).folder == Path(f"{name}-depth")
+    (tmp_path / "frames.json").touch()
+    assert Depth(capture=tmp_path / "frames.json").folder == Path("frames-depth")
 
 
 def test_debug_shows_the_traceback(run: Run, tmp_path: Path) -> None:

@@ -28,6 +28,12 @@ def test_sets_of_all_frames_have_no_companions(scene: Path) -> None:
     assert companions(capture, sets) == ()
 
 
+def test_frames_whose_maps_another_run_makes_have_no_set_here(scene: Path) -> None:
+    sets = [ViewSet("1", ("0", "2")), ViewSet("3", ("2",))]
+    found = companions(open_capture(scene), sets, working_depth=2.0, elsewhere=("2", "4"))
+    assert [views.anchor for views in found] == ["0"]
+
+
 def test_frames_that_no_set_names_help_no_companion(scene: Path) -> None:
     for far, anchor in (("0", "4"), ("4", "0")):
         sets = [ViewSet(anchor, (far,))]

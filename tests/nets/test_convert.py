@@ -18,9 +18,9 @@ from small_capture import write_capture
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.in_metres import in_metres
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import WRITERS, save_capture
+from deltas_nets.captures.scaled import in_metres
 from deltas_nets.errors import UserError
 
 NUMBERED = st.lists(st.integers(0, 10**6).map(str), min_size=1, max_size=4, unique=True)

@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import MakeCapture
 from PIL import Image
 from run_command import Run, assert_one_line
+from small_maps import write_maps
+from test_search import Oracle
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Lens
@@ -16,7 +19,10 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import save_capture
 from deltas_nets.captures.scaled import scaled
+from deltas_nets.commands.depth import Depth
 from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map, read_depth_png
+from deltas_nets.outputs.their_capture import made_of
+from deltas_nets.predict.depth_map import PredictConfig
 
 UNIT = 0.05  # of the capture's units are a metre
 
@@ -95,6 +101,30 @@ def test_a_scale_makes_it_metric(run: Run, rooms: dict[str, Path], tmp_path: Pat
         "--depth-scale",
     )
     assert not (tmp_path / "c").exists()
+
+
+def test_a_scale_is_of_depth_files_and_so_is_one_measured_by_hand(
+    make_capture: MakeCapture, tmp_path: Path
+) -> None:
+    folder = tmp_path / "own"
+    save_capture(replace(open_capture(make_capture()), metric=False), folder)
+    stated = Depth(capture=folder, scale=2.0).opened(folder)
+    file = tmp_path / "measured.txt"
+    file.write_text("1 10 20 5")
+    opened = open_capture(folder)
+    found, kept = (
+        Depth(capture=folder, scale_from=source).in_metres(
+            opened,
+            Oracle(2.5),
+            PredictConfig(),  # type: ignore[arg-type]
+        )
+        for source in (file, Path("sensor"))
+    )
+    for capture, unit in ((stated, 2.0), (found, 2.0), (kept, 1.0)):
+        assert capture.metric and capture.frame(1).read_depth().max() == pytest.approx(2.5 * unit)
+        made = made_of(opened, write_maps(capture, tmp_path / f"maps-{id(capture)}")).capture
+        assert made.fingerprint() == capture.fingerprint()
+        assert made.frame(1).read_depth().max() == pytest.approx(2.5 * unit)
 
 
 @pytest.mark.parametrize("name", DEPTH_FORMATS)

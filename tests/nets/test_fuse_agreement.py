@@ -40,11 +40,11 @@ def test_others_say_nothing_of_what_they_do_not_see() -> None:
 
 def test_depth_stays_where_more_agree_than_see_through() -> None:
     right, wrong = wall(2.0), view_of(torch.full(SIZE, 1.0))
-    assert agreeing(right, [right, right]).has_depth
-    assert not agreeing(wrong, [right, right]).has_depth
-    assert not agreeing(right, []).has_depth
-    assert not agreeing(right, [right, wall(3.0)]).has_depth
-    assert not agreeing(right, [right], least=2).has_depth
+    assert agreeing(right, [right, right]).depth.any()
+    assert not agreeing(wrong, [right, right]).depth.any()
+    assert not agreeing(right, []).depth.any()
+    assert not agreeing(right, [right, wall(3.0)]).depth.any()
+    assert not agreeing(right, [right], least=2).depth.any()
 
 
 @given(relative=st.floats(0.02, 1.0), depth=st.floats(0.1, 50.0))

@@ -14,7 +14,9 @@ from PIL import Image
 from run_command import Run, assert_one_line
 from small_capture import write_capture
 
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.errors import UserError
 from deltas_nets.fuse import FuseConfig
@@ -67,6 +69,27 @@ def test_sensor_depth_has_no_need_of_maps(
     assert abs(vertices_of(tmp_path / "out" / "cloud.ply")[:, 2] - 2.5).max() < 1e-3
 
 
+@pytest.mark.parametrize("suffix", [".png", ".npy"])
+def test_a_scale_is_that_of_poses_and_depth_files(
+    make_capture: MakeCapture, tmp_path: Path, run: Run, suffix: str
+) -> None:
+    capture = open_capture(make_capture())
+    frames = []
+    for frame in capture.frames.values():
+        file = tmp_path / f"{frame.id}.npy"
+        np.save(file, frame.read_depth())
+        frames.append(replace(frame, depth_path=file) if suffix == ".npy" else frame)
+    known = replace(capture, frames=Frames.of(frames, capture.frames.folder), metric=False)
+    save_capture(known, tmp_path / "own")
+    result = run(
+        "fuse", tmp_path / "own", "sensor", "--scale", 2, "--out", tmp_path / "out", "--cloud"
+    )
+    assert result.code == 0, result.err
+    points = vertices_of(tmp_path / "out" / "cloud.ply")
+    assert abs(points[:, 2] - 5).max() < 1e-3
+    assert (points[:, 0].min() + points[:, 0].max()) / 2 == pytest.approx(0.45, abs=0.05)
+
+
 def test_a_depth_camera_aside_is_put_where_it_stands(make_capture: MakeCapture) -> None:
     capture = open_capture(make_capture(depth_size=(24, 32)))
     view = depth_source(capture, Path("sensor")).view("1")
@@ -116,6 +139,14 @@ def test_maps_of_another_capture_are_refused(
     assert not (tmp_path / "out").exists()
 
 
+def test_maps_know_their_scale_whatever_is_said(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    result = run("fuse", *maps, "--scale", 0.3, "--out", tmp_path / "out", "--cloud")
+    assert result.code == 0, result.err
+    assert abs(vertices_of(tmp_path / "out" / "cloud.ply")[:, 2] - 2.5).max() < 1e-3
+
+
 def test_a_folder_without_maps_is_refused(
     maps: tuple[Path, Path], tmp_path: Path, run: Run
 ) -> None:
@@ -143,6 +174,18 @@ def test_voxels_too_fine_are_refused_with_those_that_fit(
     (fitting,) = re.findall(r"use (\S+) or more", result.err)
     source = depth_source(open_capture(maps[0]), maps[1])
     check_memory(look_at(source, float(fitting)), 0.1)
+
+
+def test_voxels_of_a_cloud_that_cannot_be_counted_are_refused(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    asked = ("fuse", *maps, "--out", tmp_path / "out", "--cloud", "--voxel")
+    result = run(*asked, 1e-6)
+    assert_one_line(result, "voxels of 1e-06", "too fine")
+    assert not (tmp_path / "out").exists()
+    (fitting,) = re.findall(r"use (\S+) or more", result.err)
+    assert run(*asked, fitting).code == 0
+    assert abs(vertices_of(tmp_path / "out" / "cloud.ply")[:, 2] - 2.5).max() < 1e-3
 
 
 def test_unsure_maps_get_voxels_of_a_fiftieth_of_their_depth(maps: tuple[Path, Path]) -> None:

@@ -5,6 +5,7 @@ import os
 import re
 import threading
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from hypothesis import strategies as st
 from PIL import Image
 from small_output import output_of, summary_of, write_frame
 
+from deltas_nets.commands.depth import Depth
+from deltas_nets.commands.fuse import Fuse
 from deltas_nets.errors import UserError
+from deltas_nets.fuse import FuseConfig
 from deltas_nets.outputs import prepare as output_prepare
 from deltas_nets.outputs import products
 from deltas_nets.outputs.atomic_files import write_json
@@ -30,6 +34,8 @@ from deltas_nets.outputs.products import (
     write_depth_png,
     write_points_ply,
 )
+from deltas_nets.outputs.summary import difference, shard_summary
+from deltas_nets.predict.depth_map import PredictConfig
 
 SETTINGS: dict[str, Any] = {"weights": "deltas-small", "views": 3, "depth_range": (0.5, 10.0)}
 MakeCapture = Callable[..., Path]
@@ -218,6 +224,15 @@ def test_other_settings_are_an_error_that_names_them(tmp_path: Path) -> None:
     assert files_in(tmp_path) == before
 
 
+def test_settings_that_differ_are_named_by_options_that_exist() -> None:
+    flags = {field.name for command in (Depth, Fuse) for field in fields(command)}
+    configs = {field.name for config in (PredictConfig, FuseConfig) for field in fields(config)}
+    for name in configs | {"depth", "cameras", "frames", "sensor_depth", "precision", "passes"}:
+        said = difference({"settings": {name: 1}}, {name: 2})
+        options = re.findall(r"--([a-z-]+)", said)
+        assert all(option.replace("-", "_") in flags for option in options), said
+
+
 def test_overwrite_starts_again_and_spares_what_is_not_ours(tmp_path: Path) -> None:
     write_frame(prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"]), "1")
     (tmp_path / "notes.txt").write_text("mine")
@@ -226,6 +241,22 @@ def test_overwrite_starts_again_and_spares_what_is_not_ours(tmp_path: Path) -> N
     assert not folder.is_finished("1")
     assert set(files_in(tmp_path)) == {"summary.json", "notes.txt", "depth/notes.txt"}
     assert summary_of(tmp_path)["frames"] == {}
+
+
+@pytest.mark.parametrize("shard", [(1, 1), (1, 2)])
+def test_a_folder_whose_maps_are_being_removed_is_not_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard: tuple[int, int]
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    folder = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"])
+    write_frame(folder, "1")
+    folder.write_summary("complete")
+    monkeypatch.setattr(output_prepare, "_remove_frames", killed)
+    with pytest.raises(KeyboardInterrupt):
+        prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1"], overwrite=True, shard=shard)
+    assert summary_of(tmp_path)["status"] == "stopped"
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "summary.json"])
@@ -295,6 +326,19 @@ def test_shards_share_a_folder_and_its_summary(tmp_path: Path) -> None:
         tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=["2"], overwrite=True
     )
     assert (again.is_finished("1"), again.is_finished("2")) == (True, False)
+
+
+def test_a_shard_keeps_what_a_run_of_all_frames_recorded(tmp_path: Path) -> None:
+    whole = prepare_output(tmp_path, settings=SETTINGS, frame_ids=["1", "2"])
+    for id in ("1", "2"):
+        write_frame(whole, id)
+    whole.write_summary("complete")
+    before = summary_of(tmp_path)["frames"]
+    shard = prepare_output(tmp_path, settings=SETTINGS, shard=(1, 2), frame_ids=["1"])
+    shard.keep_frame("1")
+    shard.write_summary("complete")
+    assert summary_of(tmp_path)["frames"] == before
+    assert set(json.loads(shard_summary(tmp_path, (1, 2)).read_text())["frames"]) == {"1"}
 
 
 def test_a_shard_that_is_done_waits_for_those_that_never_ran(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,11 +50,11 @@ class Oracle:
         self.asked.append(config.depth_range)
         baseline = np.linalg.norm((frames[1].cam_from_world - frames[0].cam_from_world)[:3, 3])
         depth = float(np.clip(self.wall * baseline / 0.15, *config.depth_range))
-        size = frames[0].image_size
-        keypoints = KeypointDepths(torch.zeros(9, 2), torch.full((9,), depth), size)
-        map = np.full(size, depth, dtype=np.float32)
+        keypoints = KeypointDepths(torch.zeros(9, 2), torch.full((9,), depth), wanted.size)
+        confidence = np.full(wanted.size, 0.5, dtype=np.float32)
+        map = np.where(confidence >= config.min_confidence, np.float32(depth), np.float32(0))
         points = np.array([[0.0, 0.0, depth]])
-        return DepthMap(map, np.ones_like(map), points, np.zeros((1, 3), np.uint8), keypoints)
+        return DepthMap(map, confidence, points, np.zeros((1, 3), np.uint8), keypoints)
 
 
 class Blind(Oracle):
@@ -119,6 +120,18 @@ def test_a_room_in_metres_is_searched_once_as_ever(capture: Capture) -> None:
     oracle = Oracle(2.5)
     assert Followed(capture)(oracle, VIEWS, PredictConfig()).reach == Reach(*ROOM)
     assert oracle.asked == [ROOM]
+
+
+def test_a_network_that_finds_no_point_is_asked_once(capture: Capture) -> None:
+    class Pointless(Oracle):
+        def depth_map(self, wanted: Wanted) -> DepthMap:
+            found = super().depth_map(wanted)
+            none = torch.zeros_like(found.keypoints.depth)
+            return found._replace(keypoints=found.keypoints._replace(depth=none))
+
+    oracle = Pointless(2.5)
+    found = Followed(replace(no_sensor(capture), metric=False))(oracle, VIEWS, PredictConfig())
+    assert len(oracle.asked) == 1 and found.piled is None
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -217,11 +230,26 @@ def test_the_scale_is_found_by_sensor_and_by_hand(capture: Capture, tmp_path: Pa
         file.write_text(text)
         with pytest.raises(UserError):
             scale_by_measurements(oracle, small, config, file)  # type: ignore[arg-type]
+    file.write_text("10 20 2.5")
+    with pytest.raises(UserError, match="line 1 is not ID X Y METRES"):
+        scale_by_measurements(oracle, small, config, file)  # type: ignore[arg-type]
     file.write_text("1 10 20 2.5")
     with pytest.raises(UserError, match="no depth was found"):
         scale_by_measurements(Blind(2.5), small, config, file)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="no sensor depth"):
         scale_by_sensor(oracle, no_sensor(small), config)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("written", [{"size": (32, 40)}, {"min_confidence": 1.0}])
+def test_the_scale_does_not_depend_on_what_is_written(
+    capture: Capture, tmp_path: Path, written: dict[str, Any]
+) -> None:
+    small, config = scaled(capture, 0.1, metric=False), PredictConfig(**written)
+    file = tmp_path / "measured.txt"
+    file.write_text("1 60 40 2.5\n")  # beyond a map of 32x40
+    oracle = Oracle(2.5)
+    assert scale_by_measurements(oracle, small, config, file) == pytest.approx(10)  # type: ignore[arg-type]
+    assert scale_by_sensor(oracle, small, config) == pytest.approx(10)  # type: ignore[arg-type]
 
 
 def test_a_verdict_doubts_low_confidence_and_few_points() -> None:

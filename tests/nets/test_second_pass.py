@@ -78,7 +78,8 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
         return call
 
     monkeypatch.setattr(FirstMaps, "write", stopped(keep, 4))
-    assert depth("broken", "--workers", 1).code == 130
+    said = depth("broken", "--workers", 1, "--overwrite")
+    assert said.code == 130 and "goes on, without --overwrite once maps" in said.err
     monkeypatch.setattr(FirstMaps, "write", stopped(keep, 8))
     assert depth("broken", "--workers", 1).code == 130
     first = tmp_path / "broken" / FIRST
@@ -99,8 +100,10 @@ def test_maps_that_hear_each_other_are_the_same_however_they_are_made(
     # Another network's first maps are not taken for ours, and shards leave each other's alone.
     left = FirstMaps(tmp_path / "broken", (2, 2))
     left.write("0", KnownDepth(torch.ones(1, 4, 4), torch.ones(1, 4, 4)), {})
-    assert depth("broken", "--shard", "1/2", "--overwrite").code == 0 and left.has("0")
-    assert depth("broken", "--overwrite", "--passes", 1).code == 0 and not left.has("0")
+    assert depth("broken", "--shard", "1/2", "--overwrite").code == 0 and left.file("0").exists()
+    assert depth("broken", "--overwrite", "--passes", 1).code == 0 and not left.file("0").exists()
+    left.write("0", KnownDepth(torch.ones(1, 4, 4), torch.ones(1, 4, 4)), {})
+    assert depth("broken", "--passes", 1).code == 0 and not left.file("0").exists()
     summary = json.loads((tmp_path / "whole" / "summary.json").read_text())
     assert all("valid_points" in frame for frame in summary["frames"].values())
 
@@ -143,6 +146,13 @@ def test_measured_depth_makes_maps_better_and_alone_completes_them(
     assert errors["by-hand"] < 0.8 * errors["none"]
     assert errors["sensor"] < 0.5 * errors["none"]
     assert errors["alone"] < 0.5 * errors["none"]
+
+
+def test_maps_of_one_image_hear_no_others(depth: Any, scene: Path, tmp_path: Path) -> None:
+    completed = ("--sensor-depth", "sensor", "--views", 1)
+    assert depth("whole", *completed).code == 0
+    assert depth("once", "--passes", 1, *completed).code == 0
+    assert np.array_equal(maps(tmp_path / "whole"), maps(tmp_path / "once"))
 
 
 @pytest.mark.parametrize(

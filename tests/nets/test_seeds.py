@@ -1,5 +1,6 @@
 """Confident points of depth maps, with tracks: as COLMAP itself would have them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,12 @@ from run_command import Run, assert_one_line
 from small_maps import write_maps
 
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
+from deltas_nets.captures.scaled import in_metres
+from deltas_nets.outputs.products import OWN_UNIT, OutputOptions
 
 SIZE = (48, 64)
+OWN = OutputOptions(unit=OWN_UNIT)
 
 
 @pytest.fixture
@@ -55,6 +60,28 @@ def test_maps_go_along_as_depth(run: Run, capture: Path, tmp_path: Path) -> None
     for frame in written.frames.values():
         assert frame.depth_path is not None and out in frame.depth_path.parents
         assert np.abs(frame.read_depth() - 2.5).max() < 1e-3
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_maps_points_and_poses_are_brought_into_metres_together(
+    run: Run, capture: Path, tmp_path: Path, known: bool
+) -> None:
+    """Whether `deltas depth` was told the unit or not."""
+    save_capture(replace(open_capture(capture), metric=False), tmp_path / "own")
+    opened = open_capture(tmp_path / "own")
+    made, options = (in_metres(opened, 0.3), OutputOptions()) if known else (opened, OWN)
+    deep = 2.5 * (0.3 if known else 1)
+    maps = write_maps(
+        made, tmp_path / "maps", options=options, depth=lambda size: np.full(size, deep)
+    )
+    flags = ("--depths", maps, "--scale", 0.3, "--points", 50)
+    said = run("convert", tmp_path / "own", tmp_path / "out", *flags)
+    assert said.code == 0, said.err
+    written = open_capture(tmp_path / "out")
+    assert written.metric and written.points is not None
+    assert np.abs(written.frame(1).read_depth() - 0.75).max() < 1e-3
+    assert np.abs(written.points.xyz[:, 2] - 0.75).max() < 1e-3
+    assert written.frame(3).cam_from_world[0, 3] == pytest.approx(-0.3 * 0.45)
 
 
 def test_what_no_other_map_confirms_is_no_point(run: Run, capture: Path, tmp_path: Path) -> None:

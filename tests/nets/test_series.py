@@ -24,6 +24,7 @@ from deltas_nets.ablations.steps import Series, Step
 from deltas_nets.ablations.tables import TABLES
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.commands.ablate import Table
@@ -172,7 +173,11 @@ def test_keys_differ_where_figures_may(capture: Capture, monkeypatch: pytest.Mon
     views = ViewSet("1", ("0", "2"))
     base = measuring.Measurement(capture, (views,), PredictConfig())
     series, step = TABLES["points"], TABLES["points"].steps[1]
+    elsewhere = capture.frames.cam_from_world.copy()
+    elsewhere[:, :3, 3] += 0.1
+    arrays = capture.frames.arrays._replace(cam_from_world=elsewhere)
     others = [
+        replace(base, capture=replace(capture, frames=Frames(capture.frames.folder, arrays))),
         replace(base, seed=1),
         replace(base, view_sets=(ViewSet("1", ("2", "0")),)),
         replace(base, predict=PredictConfig(work_size=(48, 64))),
@@ -185,7 +190,7 @@ def test_keys_differ_where_figures_may(capture: Capture, monkeypatch: pytest.Mon
     keys.add(base.key(TABLES["ratio"], step, {"sha256": "a"}))
     monkeypatch.setattr(measuring, "__version__", "of another day")
     keys.add(base.key(series, step, {"sha256": "a"}))
-    assert len(keys) == 8 and key_of({"a": 1}) != key_of({"a": 2})
+    assert len(keys) == 9 and key_of({"a": 1}) != key_of({"a": 2})
 
 
 def test_a_table_that_was_stopped_goes_on_and_measures_nothing_twice(

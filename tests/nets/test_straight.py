@@ -13,7 +13,13 @@ from deltas_geom.cameras.pixels import pixel_grid
 from deltas_nets.captures.frame import Frame, Lens
 from deltas_nets.captures.images import Span
 from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
-from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, Wanted
+from deltas_nets.predict.depth_map import (
+    DepthMap,
+    KeypointDepths,
+    PredictConfig,
+    Wanted,
+    point_cloud,
+)
 from deltas_nets.predict.look import look
 from deltas_nets.predict.reach import Reach
 
@@ -120,6 +126,31 @@ def test_depth_is_of_the_photos_pixels(name: str, tmp_path: Path) -> None:
     assert np.abs(found.depth - true)[known].max() < 0.02
     assert np.allclose(found.confidence, found.depth / 4)
     assert found.log_std is not None and found.log_std.shape == (1, *SIZE)
+
+
+class SeesPoints(Sees):
+    """With a point for every pixel of the straight image."""
+
+    def depth_map(self, wanted: Wanted) -> DepthMap:
+        found, frame = super().depth_map(wanted), wanted.anchor
+        points, colors = point_cloud(frame, found.depth, frame.image_size, frame.image_size)
+        return found._replace(points=points, colors=colors)
+
+
+@pytest.mark.parametrize("name", ["barrel", "fisheye", "pincushion"])
+def test_points_are_those_that_the_photo_shows(name: str, tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 5, -4, 3
+    photo = replace(photo_of(name, tmp_path), cam_from_world=pose)
+    reach = Reach(0.5, 10.0, unit=2.0)
+    found = look(SeesPoints(), [photo], PredictConfig(), reach)  # type: ignore[arg-type]
+    lens = GeomLens(
+        torch.tensor(K), torch.tensor(photo.lens.coefficients).double(), photo.lens.model
+    )
+    pixels = lens.project(torch.from_numpy(found.points + pose[:3, 3])).pixels
+    assert ((pixels > -0.51) & (pixels < torch.tensor([127.51, 95.51]))).all()
+    straightened = np.prod(straight(photo).image_size)
+    assert 0.6 * straightened < len(found.points) == len(found.colors) < straightened
 
 
 def test_a_frame_without_a_lens_is_straight(tmp_path: Path) -> None:

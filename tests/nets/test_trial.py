@@ -14,6 +14,7 @@ from run_command import Run
 
 from deltas_nets import load_model
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.spread import spread
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict import trial
@@ -24,7 +25,6 @@ from deltas_nets.predict.depth_map import (
     PredictConfig,
     Wanted,
 )
-from deltas_nets.predict.first_look import spread
 from deltas_nets.predict.ours import num_points, work_size_of
 from deltas_nets.predict.search import Asked
 from deltas_nets.predict.trial import (

@@ -15,6 +15,7 @@ from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.sets_file import sets_file
+from deltas_nets.captures.usable import lone_frames, usable_view_sets
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
@@ -71,7 +72,22 @@ def test_a_set_that_names_a_lost_pose_is_an_error(make_capture: MakeCapture) -> 
 
 def test_an_anchor_may_stand_alone_with_sensor_depth(capture: Capture, tmp_path: Path) -> None:
     path = write_view_sets(tmp_path, [{"anchor": 1, "sources": []}])
-    assert read_view_sets(path, capture, allow_no_sources=True) == (ViewSet("1", ()),)
+    assert lone_frames(capture, path, None).view_sets == (ViewSet("1", ()),)
+
+
+def test_views_are_chosen_for_frames_of_which_the_capture_says_nothing(
+    capture: Capture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stated = {"0": ("2",), "2": (), "3": ("gone",)}
+    found = usable_view_sets(replace(capture, sources=stated), None, 3).view_sets
+    chosen = dict(choose_view_sets(capture, 3))
+    assert dict(found) == {"0": ("2",), "1": chosen["1"], "3": chosen["3"]}
+    assert "views are chosen where the capture states none that are there: 1, 3" in (
+        capfd.readouterr().err
+    )
+    nobody = dict.fromkeys(capture.frames, ())
+    with pytest.raises(UserError, match="no view goes with it"):
+        usable_view_sets(replace(capture, sources=nobody), None, 3)
 
 
 def test_frames_that_sets_name_are_checked_and_others_are_not(make_capture: MakeCapture) -> None:

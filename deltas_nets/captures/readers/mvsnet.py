@@ -162,8 +162,8 @@ def _sources(path: Path, cameras: Path, frames: Frames) -> Mapping[str, tuple[st
             ids = tuple(f"{int(word):08d}" for word in listed)
             place += 2 + 2 * max(count, 0)
             known = tuple(dict.fromkeys(id for id in ids if id in frames))
-            if f"{view:08d}" in frames and known:
+            if f"{view:08d}" in frames and (known or count <= 0):
                 sources[f"{view:08d}"] = tuple(id for id in known if id != f"{view:08d}")
     except ValueError as error:
         raise UserError("the pairs hold words where numbers should be", file, remedy) from error
-    return {view: found for view, found in sources.items() if found} or None
+    return sources if any(sources.values()) else None

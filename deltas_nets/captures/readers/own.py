@@ -214,9 +214,10 @@ def _depth_ranges(root: Fields, frames: Sequence[Fields]) -> FloatArray | None:
 def _sources(
     frames: Sequence[Fields], ids: Sequence[str], known: Sequence[str]
 ) -> dict[str, tuple[str, ...]] | None:
-    """The views that go with each frame, those that are lost left out."""
-    if not any("sources" in frame for frame in frames):
-        return None
+    """The views that go with each frame, those that are lost left out.
+
+    A frame that states none is not among them, nor is one of whose views all are lost.
+    """
     usable, all_ids = set(ids), set(known)
     sources = {}
     for id, frame in zip(ids, frames, strict=True):
@@ -224,5 +225,7 @@ def _sources(
         unknown = next((name for name in names if name not in all_ids), None)
         if unknown is not None:
             raise frame.error(f"has a source {unknown[:40]!r}, which is no frame")
-        sources[id] = tuple(name for name in names if name in usable and name != id)
-    return sources
+        found = tuple(name for name in names if name in usable and name != id)
+        if found or ("sources" in frame and not names):
+            sources[id] = found
+    return sources or None

@@ -62,8 +62,9 @@ def read(path: Path) -> Capture:
         )
     capture = found.capture(path, "Robust MVD", metric=True)
     of_key = tuple(id for id in folders if id in capture.frames and id != "key")
-    together = {"key": of_key} if "key" in capture.frames and of_key else None
-    return replace(capture, sources=together)
+    if "key" not in capture.frames or not of_key:
+        return capture
+    return replace(capture, sources={**dict.fromkeys(of_key, ()), "key": of_key})
 
 
 def _matrix(path: Path, side: int) -> FloatArray:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from deltas_nets.captures.capture import Capture, Frame
-from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.depth_files import FLOATS, MILLIMETRES
 from deltas_nets.captures.images import Span, decode, open_span
 from deltas_nets.captures.readers.names import DEPTH_SUFFIXES
 from deltas_nets.captures.register import register_depth
@@ -107,12 +107,18 @@ def put_depth(frame: Frame, target: Path, putting: Putting) -> PutDepth | None:
 
     Returns:
         None where the frame has no depth.
+
+    Raises:
+        UserError: the file is missing, or holds floats of another unit.
     """
     if frame.depth_path is None:
         return None
     suffix = frame.depth_path.suffix.lower()
     if frame.depth_span is not None or suffix not in DEPTH_SUFFIXES:
         return write_millimetres(frame.read_depth(), target, frame)
+    if suffix in FLOATS and frame.depth_unit != 1:
+        what = f"depth of {frame.id} is in floats of another unit than the capture is written in"
+        raise UserError(what, frame.depth_path, "scale the files, or leave depth out")
     file = target.with_name(target.name + suffix)
     _put(_Source(frame.depth_path, None), file, putting.placing, f"depth of {frame.id}")
     return PutDepth(file, frame.depth_scale)

@@ -76,8 +76,8 @@ def _frame(capture: Capture, index: int, folder: Path, putting: Putting) -> dict
             said["depth_camera"] = _depth_camera(frame)
     if capture.depth_ranges is not None:
         said["depth_range"] = capture.depth_ranges[index].tolist()
-    if capture.sources is not None:
-        said["sources"] = [id_in_json(id) for id in capture.sources.get(frame.id, ())]
+    if capture.sources is not None and frame.id in capture.sources:
+        said["sources"] = [id_in_json(id) for id in capture.sources[frame.id]]
     return said
 
 

@@ -12,10 +12,9 @@ from deltas_nets.evaluate.protocols.fixed_gap import fixed_gap_view_sets, gap_of
 from deltas_nets.evaluate.some_sets import evenly_spaced
 from deltas_nets.outputs.summary import recorded_view_sets
 
-__all__ = ["PROTOCOLS", "ProtocolName", "SceneViews", "ViewProtocol"]
+__all__ = ["ProtocolName", "SceneViews", "ViewProtocol"]
 
 ProtocolName = Literal["chosen", "paper", "deepvideomvs"]
-PROTOCOLS: tuple[ProtocolName, ...] = ("chosen", "paper", "deepvideomvs")
 VERSION = 1
 """Of all rules; a change that moves a figure raises it."""
 USUAL = {"paper": 3, "deepvideomvs": 3}

@@ -1,0 +1,61 @@
+"""What `deltas depth` writes, in which unit and in which steps."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+from deltas_nets.commands.flags import sensible
+from deltas_nets.errors import UserError
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+    from deltas_nets.outputs.products import OutputOptions
+
+
+def asked_options(
+    depth_scale: float | None, format: Literal["png", "npz", "tiff", "pfm"]
+) -> "OutputOptions":
+    """The options as flags have them, before there is a capture.
+
+    Raises:
+        UserError: steps are asked for where there are none.
+    """
+    from deltas_nets.outputs.products import OutputOptions
+
+    if depth_scale is not None and format != "png":
+        what = f"depth is written as float32 in {format}"
+        raise UserError(what, "--depth-scale", "leave it out")
+    given = {} if depth_scale is None else {"depth_scale": depth_scale}
+    return sensible(OutputOptions, depth_format=format, **given)
+
+
+def fitting_options(
+    options: "OutputOptions",
+    capture: "Capture",
+    depth: float | None,
+    depth_scale: float | None,
+    depth_range: tuple[float, float] | None,
+) -> "OutputOptions":
+    """The options with the capture's unit, and steps that are fine and reach far enough.
+
+    Args:
+        options: as asked.
+        capture: the frames.
+        depth: how far typical surfaces are, if a first look told it.
+        depth_scale: as asked, if it was.
+        depth_range: as asked, if it was.
+
+    Raises:
+        UserError: the steps that are asked for do not reach as far as depth is searched.
+    """
+    from deltas_nets.captures.known_depths import farthest_depth
+    from deltas_nets.captures.working_depth import working_depths
+    from deltas_nets.outputs.products import OWN_UNIT, check_depth_fits, steps_to
+
+    far = depth_range[1] if depth_range else farthest_depth(capture)
+    if not capture.metric:
+        options = replace(options, unit=OWN_UNIT)
+        usual = float(working_depths(capture).max()) if depth is None else depth
+        if depth_scale is None:
+            return replace(options, depth_scale=steps_to(max(far, 4 * usual)))
+    check_depth_fits((0.0, far), options)
+    return options
