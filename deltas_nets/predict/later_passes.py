@@ -13,6 +13,7 @@ from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.neighbours import neighbours, sample
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.spread import spread
 from deltas_nets.captures.straight import straight
 from deltas_nets.errors import UserError
 from deltas_nets.network.known_depth import KnownDepth
@@ -20,7 +21,6 @@ from deltas_nets.network.unit import unit_of
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
 from deltas_nets.predict.described import AtSize
-from deltas_nets.predict.first_look import spread
 from deltas_nets.predict.look import as_photographed
 from deltas_nets.predict.predictor import Predictor
 

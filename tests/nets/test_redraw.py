@@ -23,6 +23,7 @@ from deltas_nets.network.lite.redraw import WINDOW, Redraw, kept_at_large
 from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.later_passes import LaterPasses
 from deltas_nets.predict.ours import DeltasPredictor
+from deltas_nets.predict.views_alone import ViewsAlone
 from deltas_nets.train.heard_rooms import HeardRooms, hear_each_other
 from deltas_nets.train.redraw import (
     RedrawConfig,
@@ -204,7 +205,7 @@ def test_maps_that_hear_each_other_in_memory_do_as_those_of_a_capture(
     )
     for n, id in enumerate(ids):
         first.write(id, KnownDepth(*(part[n] for part in alone)), {})
-    passes = LaterPasses(capture, first, ids, lambda _, agreed: agreed)
+    passes = LaterPasses(capture, first, ids, ViewsAlone())  # type: ignore[arg-type]
     second = first.of_pass(2)
     for id in ids:
         second.write(id, passes.hear(id, first), {})
@@ -325,7 +326,7 @@ def test_a_capture_in_another_unit_is_drawn_alike(
         first = FirstMaps(tmp_path / str(scale))
         map = KnownDepth(scale * maps(3, (64, 96))[0], torch.full((1, 64, 96), 0.05))
         first.write(id, map, {})
-        passes = LaterPasses(in_unit, first, [id], predictor.redrawn)
+        passes = LaterPasses(in_unit, first, [id], predictor)
         found.append(passes.drawn(id, map).depth / scale)
     torch.testing.assert_close(found[1], found[0], rtol=1e-4, atol=0)
     assert not found[0].equal(maps(3, (64, 96))[0])
