@@ -17,8 +17,8 @@ from deltas_nets.predict.encoded_frames import EncodedFrames
 
 __all__ = ["AtSize", "DescribedFrames"]
 
-CAPACITY = 32
-"""Frames that are kept: 4 MB each at 240 x 320, 15 MB at 480 x 640."""
+CAPACITY = 500_000_000
+"""Bytes: of 135 frames at 240 x 320, of 34 at 480 x 640."""
 
 
 class AtSize(NamedTuple):
@@ -29,11 +29,11 @@ class AtSize(NamedTuple):
 
 
 class DescribedFrames:
-    """Remembers the descriptors of the frames used last, which are a quarter of what is encoded.
+    """Remembers the descriptors of the frames used last, which are a part of what is encoded.
 
     Args:
         encode: the encoder that makes them.
-        capacity: how many frames are remembered.
+        capacity: bytes that are remembered, or one frame where that is more.
     """
 
     def __init__(self, encode: EncodedFrames, *, capacity: int = CAPACITY) -> None:
@@ -77,6 +77,9 @@ class DescribedFrames:
         with self._lock:
             self._known[key] = known
             self._known.move_to_end(key)
-            while len(self._known) > self.capacity:
+            while len(self._known) > 1 and self._bytes() > self.capacity:
                 self._known.popitem(last=False)
         return known
+
+    def _bytes(self) -> int:
+        return sum(maps.nbytes for maps in self._known.values())

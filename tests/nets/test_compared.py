@@ -163,7 +163,7 @@ def test_frames_are_described_once(capture: Capture) -> None:
             encoded.append("once")
             return encode(frames, work_size=work_size)  # type: ignore[arg-type]
 
-    describe = DescribedFrames(Counting(encode.model), capacity=2)
+    describe = DescribedFrames(Counting(encode.model), capacity=2 * 32 * 48 * 48 * 4)
     frames = list(capture.frames.values())[:3]
     first = describe(AtSize(frames[0], (64, 96)))
     again = describe(AtSize(frames[0], (64, 96)))
