@@ -285,6 +285,15 @@ def test_numbers_without_sense_are_masked_or_right_and_never_nan(name: str, valu
         assert not any(g.isnan().any() for g in gradients if g is not None)
 
 
+@EACH
+def test_a_pixel_that_was_not_seen_stays_so(name: str) -> None:
+    lens, odd = ALL[name].lens(), torch.tensor([[math.nan, 1], [1, math.inf], [1e9, 1]]).double()
+    pixels, valid = geom.undistort_pixels(lens, odd.requires_grad_())
+    assert pixels[:2].isnan().all() and pixels[2].isfinite().all() and not valid[:2].any()
+    (slope,) = torch.autograd.grad(pixels[2].sum(), odd)
+    assert slope.isfinite().all()
+
+
 def test_lenses_of_a_batch_broadcast_with_points() -> None:
     case = CASES["OPENCV"]
     lens, pixels = case.lens(), pixels_of(7)

@@ -18,6 +18,7 @@ from deltas_geom.numerics.arithmetic import (
     numbers_or_zero,
     only,
     surely_all,
+    unless_all,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -53,7 +54,7 @@ def undistort_pixels(lens: Lens, pixels: Tensor, new_K: Tensor | None = None) ->
 
     Returns:
         Not valid are pixels of no ray (:meth:`Lens.unproject`), or of one that a pinhole camera
-        cannot see, 90 degrees or more off its axis.
+        cannot see, 90 degrees or more off its axis: (0, 0). A pixel that is not finite is NaN.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
@@ -74,8 +75,11 @@ def _straightened(
     K: Tensor, coefficients: Tensor, model: str, pixels: Tensor, new_K: Tensor
 ) -> tuple[Tensor, Tensor]:
     rays, valid = Lens(K, coefficients, model).unproject(pixels)
-    pixels, ahead = Lens(new_K, new_K.new_zeros(0), "PINHOLE").project(rays)
-    return only(pixels, valid.unsqueeze(-1)), ahead & valid
+    straight, ahead = Lens(new_K, new_K.new_zeros(0), "PINHOLE").project(rays)
+    # For a triangulation without the mask: a wrong pixel would be believed.
+    seen = unless_all(pixels.isfinite().all(dim=-1, keepdim=True))
+    straight = only(only(straight, valid.unsqueeze(-1)), seen, other=torch.nan)
+    return straight, ahead & valid
 
 
 def undistort_image(
