@@ -44,6 +44,8 @@ def test_names_and_counts_that_are_wrong_are_told_with_the_right_ones() -> None:
         Lens.from_opencv(K, torch.ones(14))
     with pytest.raises(geom.ShapeError, match="K must have shape"):
         Lens(torch.eye(4), torch.zeros(4), "OPENCV")
+    with pytest.raises(geom.ShapeError, match=r"\(48, 64, 3\): use image.movedim\(-1, -3\)"):
+        geom.undistort_image(Lens(K, torch.zeros(4), "OPENCV"), torch.rand(48, 64, 3))
     with pytest.raises(TypeError, match="coefficients must be"):
         Lens(K, [0.0] * 4, "OPENCV")
 

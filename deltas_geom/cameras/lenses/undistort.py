@@ -12,7 +12,7 @@ from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.lenses.lens import Lens, LensPixels
 from deltas_geom.cameras.pixels import in_image, normalize_pixels, pixel_grid
 from deltas_geom.cameras.projection import pixel_rays
-from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.checks import ShapeError, batch_shape, check_image_size, check_shapes
 from deltas_geom.numerics.arithmetic import (
     finite_or_zero,
     numbers_or_zero,
@@ -120,6 +120,8 @@ def undistort_image(
         True
     """
     check_shapes(image=(image, "C H W"))
+    if image.shape[-1] <= 4 < image.shape[-3]:
+        raise ShapeError(f"image ends in channels, {tuple(image.shape)}: use image.movedim(-1, -3)")
     if not 0 <= alpha <= 1:
         raise ValueError(f"alpha must be from 0 (all seen) to 1 (all kept), got {alpha}")
     old_size = (image.shape[-2], image.shape[-1])
