@@ -194,8 +194,8 @@ class Call:
         dims = (-2, -1, -1, -1, -1, *([-3] if covariance else []), -1)
         found = self._computed(derivable, values, dims)
         points, depth, residual, parallax, errors, *noise, status = found
-        cov = noise[0] if noise else None
-        return Triangulation(points, depth, status, ok(status), residual, parallax, cov, errors)
+        cov, angle = noise[0] if noise else None, parallax.detach()
+        return Triangulation(points, depth, status, ok(status), residual, angle, cov, errors)
 
     def _computed(
         self, function: Function, values: Function, outputs: tuple[int, ...]

@@ -61,7 +61,7 @@ def reprojection_residual(
 
 @without_autocast
 def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
-    """Largest angle between the rays of used views at a point, ``(*B, N)`` rad.
+    """Largest angle between the rays of used views at a point, ``(*B, N)`` rad; no gradient.
 
     Args:
         proj: ``(*B, V, 3, 4)``; cameras of unused views may hold anything.
