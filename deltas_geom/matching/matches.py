@@ -17,6 +17,7 @@ from deltas_geom.numerics.arithmetic import (
     finite_or_zero,
     only,
     unless_all,
+    values_at_hand,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -240,6 +241,10 @@ def match_joint(
     Returns:
         The projections of the one decided depth into the sources that can see it, weight =
         peak of the joint distribution.
+
+    Raises:
+        ValueError: each source has inverse depths of its own; not noticed where values are not on
+            the CPU, or traced.
     """
     check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N 1 M"))
     check_bool(mask=samples.mask)
@@ -248,6 +253,8 @@ def match_joint(
     count = seen.to(scores.dtype).sum(dim=-3)
     mean = safe_divide(only(scores, seen).sum(dim=-3), count, count > 0)
     inv_depth = samples.inv_depth.select(-3, 0)
+    if values_at_hand(inv_depth) and bool((samples.inv_depth != inv_depth.unsqueeze(-3)).any()):
+        raise ValueError("samples must have one inv_depth for all sources: use sample_inv_depths")
     found = soft_argmax(mean, inv_depth[..., None], mask=count > 0, window=window)
     return matches_at(
         views,
