@@ -94,4 +94,4 @@ def _of_call(
 
 def _version_of(tensor: Tensor) -> int | None:
     """How often it was changed in place; None where torch does not count."""
-    return None if tensor.is_inference() or torch.compiler.is_compiling() else tensor._version
+    return None if torch.compiler.is_compiling() or tensor.is_inference() else tensor._version
