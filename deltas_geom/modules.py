@@ -70,7 +70,7 @@ class Triangulator(nn.Module):
         return self.prepare(proj).full(pixels, weights, mask)
 
     def prepare(self, proj: Tensor) -> PreparedTriangulator:
-        """The same for cameras ``(*B, V, 3, 4)`` that stay: 17 joints then cost a third less."""
+        """The same for cameras ``(*B, V, 3, 4)`` that stay: 17 joints then cost a fifth less."""
         return PreparedTriangulator(
             proj, frame=self.frame, covariance=self.covariance, max_residual=self.max_residual
         )
