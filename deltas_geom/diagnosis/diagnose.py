@@ -5,7 +5,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import ShapeError, check_batch, check_bool, check_positive
+from deltas_geom.checks import ShapeError, check_batch, check_bool, check_kind, check_positive
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
 from deltas_geom.diagnosis.hypotheses import Hypothesis, pixels_at, resized, shifted
@@ -95,6 +95,7 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
 
 def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: float) -> Tensor:
     """``(V, N)`` what is observed and finite."""
+    check_kind("views", views, PosedViews, "PosedViews(K, cam_from_world)")
     views.check_shapes()
     batch = check_batch(
         K=(views.K, "V 3 3"),

@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from deltas_geom.checks import check_shapes
 from deltas_geom.numerics.arithmetic import at_least_single, without_autocast
-from deltas_geom.triangulation.equations import Frame
+from deltas_geom.triangulation.equations import Frame, check_settings
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
 
@@ -45,6 +46,8 @@ class PreparedTriangulator:
         covariance: bool = False,
         max_residual: float | None = None,
     ) -> None:
+        check_shapes(proj=(proj, "+V 3 4"))
+        check_settings(frame, max_residual)
         self.proj = proj
         self.frame: Frame = frame
         self.covariance = covariance

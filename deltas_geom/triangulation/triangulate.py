@@ -8,7 +8,7 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, transformed
-from deltas_geom.triangulation.equations import Frame, Rig, rig_of
+from deltas_geom.triangulation.equations import FRAMES, Frame, Rig, check_settings, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
 from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed
@@ -138,8 +138,8 @@ class Call:
         mask: Tensor | None,
         frame: Frame,
     ) -> None:
-        if frame not in ("rig", "world"):
-            raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+        if frame not in FRAMES:
+            check_settings(frame)
         proj = known.proj
         self.batch = check_observed(proj, pixels, weights, mask)
         self.tensors: tuple[Any, ...] = (proj, pixels, weights, mask)

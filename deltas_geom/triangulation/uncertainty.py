@@ -184,6 +184,7 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         >>> depth_variance(torch.eye(3, 4)[None], torch.diag(torch.tensor([1.0, 2.0, 9.0]))[None])
         tensor([[9.]])
     """
+    check_tensor(covariance=covariance)  # None: it was not asked for
     check_batch(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
     (cameras, _), work = finite_cameras(proj), solver_dtype(proj)

@@ -12,7 +12,7 @@ from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.lenses.lens import Lens, LensPixels
 from deltas_geom.cameras.pixels import in_image, normalize_pixels, pixel_grid
 from deltas_geom.cameras.projection import pixel_rays
-from deltas_geom.checks import ShapeError, batch_shape, check_image_size, check_shapes
+from deltas_geom.checks import ShapeError, batch_shape, check_image_size, check_kind, check_shapes
 from deltas_geom.numerics.arithmetic import (
     finite_or_zero,
     numbers_or_zero,
@@ -65,6 +65,7 @@ def undistort_pixels(lens: Lens, pixels: Tensor, new_K: Tensor | None = None) ->
         >>> undistort_pixels(lens, torch.tensor([[306.25, 120.0]])).pixels
         tensor([[310., 120.]])
     """
+    check_kind("lens", lens, Lens, "Lens(K, coefficients, model)")
     new_K = lens.K if new_K is None else new_K
     check_shapes(new_K=(new_K, "3 3"))
     return LensPixels(*_straightened(lens.K, lens.coefficients, lens.model, pixels, new_K))
@@ -119,6 +120,7 @@ def undistort_image(
         >>> bool(undistorted.mask.all())
         True
     """
+    check_kind("lens", lens, Lens, "Lens(K, coefficients, model)")
     check_shapes(image=(image, "C H W"))
     if image.shape[-1] <= 4 < image.shape[-3]:
         raise ShapeError(f"image ends in channels, {tuple(image.shape)}: use image.movedim(-1, -3)")
