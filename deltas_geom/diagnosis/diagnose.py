@@ -96,16 +96,10 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
 def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: float) -> Tensor:
     """``(V, N)`` what is observed and finite."""
     check_kind("views", views, PosedViews, "PosedViews(K, cam_from_world)")
-    views.check_shapes()
-    batch = check_batch(
-        K=(views.K, "V 3 3"),
-        cam_from_world=(views.cam_from_world, "V 4 4"),
-        pixels=(pixels, "V N 2"),
-        mask=(mask, "V N"),
-    )
-    check_bool(mask=mask)
-    if batch:
+    seen = {"pixels": (pixels, "V N 2"), "mask": (mask, "V N")}
+    if views.check_shapes() or check_batch(K=(views.K, "V 3 3"), **seen):
         raise ShapeError("diagnose takes one set of views: no batch dims")
+    check_bool(mask=mask)
     if views.num_views < 2:
         raise ShapeError(f"diagnose needs 2 views or more, got {views.num_views}")
     check_positive(threshold=threshold)

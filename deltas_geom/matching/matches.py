@@ -10,7 +10,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_batch, check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_bool, check_positive, check_shapes
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
 from deltas_geom.numerics.arithmetic import (
     both,
@@ -173,8 +173,7 @@ def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor
         tensor([2.0000, 0.2500])
     """
     check_shapes(covariance=(covariance, "2 2"))
-    if not floor > 0:
-        raise ValueError(f"floor must be positive, got {floor}")
+    check_positive(floor=floor)
     variance = (covariance[..., 0, 0] + covariance[..., 1, 1]) / 2 + floor**2
     known = unless_all(variance.isfinite() & (variance > 0))
     # Double where: the unused branch must not turn the gradient into NaN.

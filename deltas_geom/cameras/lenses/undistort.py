@@ -54,7 +54,8 @@ def undistort_pixels(lens: Lens, pixels: Tensor, new_K: Tensor | None = None) ->
 
     Returns:
         Not valid are pixels of no ray (:meth:`Lens.unproject`), or of one that a pinhole camera
-        cannot see, 90 degrees or more off its axis: (0, 0). A pixel that is not finite is NaN.
+        cannot see, 90 degrees or more off its axis; they are (0, 0), but NaN where a pixel or lens
+        is not finite.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
@@ -77,9 +78,12 @@ def _straightened(
 ) -> tuple[Tensor, Tensor]:
     rays, valid = Lens(K, coefficients, model).unproject(pixels)
     straight, ahead = Lens(new_K, new_K.new_zeros(0), "PINHOLE").project(rays)
+    straight = only(straight, valid.unsqueeze(-1))
     # For a triangulation without the mask: a wrong pixel would be believed.
-    seen = unless_all(pixels.isfinite().all(dim=-1, keepdim=True))
-    straight = only(only(straight, valid.unsqueeze(-1)), seen, other=torch.nan)
+    cameras = (x.unsqueeze(-2) for x in (K.flatten(-2), coefficients, new_K.flatten(-2)))
+    for part in (pixels, *cameras):
+        finite = unless_all(part.isfinite().all(dim=-1, keepdim=True))
+        straight = only(straight, finite, other=torch.nan)
     return straight, ahead & valid
 
 
