@@ -194,9 +194,7 @@ class PosedViews(Record):
             view = operator.index(index)
             # Not a list, which is copied to the device and waited for.
             return type(self)(*(tensor.select(-3, view).unsqueeze(-3) for tensor in self))
-        return self._replace(
-            K=self.K[..., index, :, :], cam_from_world=self.cam_from_world[..., index, :, :]
-        )
+        return type(self)(*(tensor[..., index, :, :] for tensor in self))
 
     def resize(self, *, old_size: tuple[int, int], new_size: tuple[int, int]) -> Self:
         """The same cameras when their images are resized."""
@@ -242,24 +240,21 @@ class PosedViews(Record):
     def check_values(self) -> None:
         """Raise ``ValueError`` unless K is an upper triangular camera and poses are rigid.
 
-        Call it once where cameras are read. It finds what no operation sees: rotations with a
-        scale, a shear or a mirror, a last row that is not (0, 0, 0, 1), K with zeros or negative
-        focal lengths, transposed or not scaled to K[2, 2] = 1, NaN and infinity; and the shapes
-        of :meth:`check_shapes`. Apart from the operations because looking at values stalls an
-        accelerator.
+        Call it once where cameras are read: no operation looks at values, as that stalls an
+        accelerator. It names a view and what is wrong: a scale, a shear or a mirror, a last row
+        that is not (0, 0, 0, 1), K transposed or not scaled to K[2, 2] = 1, NaN and infinity.
         """
         try:
             self.check_shapes()
         except TypeError as error:
             raise ValueError(str(error)) from error
         K, pose = self
-        focal = K.diagonal(dim1=-2, dim2=-1)[..., :2]
         lower = torch.stack([K[..., 1, 0], K[..., 2, 0], K[..., 2, 1], K[..., 2, 2] - 1], dim=-1)
         off = (pose[..., 3, :].float() - torch.eye(4, device=pose.device)[3]).abs()
         det = torch.linalg.det(pose[..., :3, :3].float().nan_to_num())
         for wanted, good in (
             ("K must be finite", K.isfinite().all(-1)),
-            ("K must have positive focal lengths", focal > 0),
+            ("K must have positive focal lengths", K.diagonal(dim1=-2, dim2=-1)[..., :2] > 0),
             ("K must be upper triangular with K[2, 2] = 1", lower == 0),
             ("cam_from_world must be finite", pose.isfinite().all(-1)),
             ("cam_from_world must be rigid, with the last row 0 0 0 1", off <= 1e-3),
