@@ -1,5 +1,7 @@
 """What arguments must be, in the words of every error."""
 
+from collections.abc import Sized
+
 import torch
 from torch import Tensor
 
@@ -80,6 +82,13 @@ def check_tensor(**named: object) -> None:
             raise TypeError(f"{name} must be a torch.Tensor, got {kind}{cure}")
 
 
+def check_kind(name: str, value: object, kind: type, cure: str) -> None:
+    """Raise ``TypeError`` with the cure unless ``value`` is of our ``kind``."""
+    if not isinstance(value, kind):
+        given = type(value).__name__
+        raise TypeError(f"{name} must be {kind.__name__}, got {given}: use {cure}")
+
+
 def check_bool(**named: Tensor | None) -> None:
     """Raise ``TypeError`` unless every mask given is bool: numbers may mean weights, or indices."""
     for name, mask in named.items():
@@ -148,13 +157,15 @@ def check_positive(**named: float) -> None:
 
 def check_depth_range(depth_range: tuple[float, float]) -> None:
     """Raise ``ValueError`` unless ``0 < near < far`` (far may be infinite)."""
-    near, far = depth_range
-    if not 0 < near < far:
+    if not _is_pair(depth_range) or not 0 < depth_range[0] < depth_range[1]:
         raise ValueError(f"depth_range must be (near, far) with 0 < near < far, got {depth_range}")
 
 
 def check_image_size(image_size: tuple[int, int]) -> None:
     """Raise ``ValueError`` unless ``image_size`` is (height, width) of at least one pixel."""
-    height, width = image_size
-    if height < 1 or width < 1:
+    if not _is_pair(image_size) or min(image_size) < 1:
         raise ValueError(f"image_size must be (height, width) >= (1, 1), got {image_size}")
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, Sized) and len(value) == 2

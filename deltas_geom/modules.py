@@ -9,6 +9,7 @@ from deltas_geom.cameras.views import PosedViews
 from deltas_geom.epipolar.sampling import Samples, sample_segments
 from deltas_geom.epipolar.segments import epipolar_segments
 from deltas_geom.rasterize import SparseDepth, rasterize_depth
+from deltas_geom.triangulation.equations import check_settings
 from deltas_geom.triangulation.prepared import PreparedTriangulator
 from deltas_geom.triangulation.results import Triangulation
 
@@ -55,6 +56,7 @@ class Triangulator(nn.Module):
         max_residual: float | None = None,
     ) -> None:
         super().__init__()
+        check_settings(frame, max_residual)
         self.frame = frame
         self.covariance = covariance
         self.max_residual = max_residual
@@ -70,7 +72,7 @@ class Triangulator(nn.Module):
         return self.prepare(proj).full(pixels, weights, mask)
 
     def prepare(self, proj: Tensor) -> PreparedTriangulator:
-        """The same for cameras ``(*B, V, 3, 4)`` that stay: 17 joints then cost a third less."""
+        """The same for cameras ``(*B, V, 3, 4)`` that stay: 17 joints then cost a fifth less."""
         return PreparedTriangulator(
             proj, frame=self.frame, covariance=self.covariance, max_residual=self.max_residual
         )

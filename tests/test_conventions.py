@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ from deltas_geom import (
 from deltas_geom.testing import default_intrinsics, forward_motion, rigid, ring
 
 PAGE = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text()
-NERF, DLT = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+OPENCV, NERF, DLT = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
 IDENTITY = PosedViews(default_intrinsics()[None], torch.eye(4).double()[None])
 
 
@@ -174,6 +175,16 @@ def test_kornia_cameras_project_and_unproject_as_ours_do() -> None:
     again = PosedViews.from_kornia(theirs)
     assert_close(again.K, K, rtol=0, atol=0)
     assert_close(again.cam_from_world, pose, rtol=0, atol=0)
+
+
+def test_the_snippet_on_opencv_gives_poses_that_project_as_its_own() -> None:
+    names: dict[str, Any] = {}
+    exec(compile(OPENCV, "docs/conventions.md", "exec"), names)
+    K, points = default_intrinsics(), torch.tensor([[0.3, 0.2, 4.0], [-0.5, 1.0, 3.0]]).double()
+    seen = project(PosedViews(K.expand(2, 3, 3), names["cam_from_world"]), points).pixels
+    for ours, rvec, tvec in zip(seen, names["rvecs"], names["tvecs"], strict=True):
+        theirs, _ = names["cv2"].projectPoints(points.numpy(), rvec, tvec, K.numpy(), None)
+        assert_close(ours, torch.from_numpy(theirs[:, 0]), rtol=0, atol=1e-9)  # px
 
 
 def test_the_snippet_on_nerf_looks_along_minus_z_with_the_angle_from_edge_to_edge() -> None:

@@ -11,7 +11,7 @@ from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
 from deltas_geom.cameras.posed_shapes import posed_shapes
 from deltas_geom.cameras.poses import invert_pose, is_rigid, recentred
 from deltas_geom.cameras.pytorch3d import from_pytorch3d
-from deltas_geom.checks import ShapeError, check_tensor
+from deltas_geom.checks import ShapeError, check_kind, check_tensor
 from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
@@ -194,9 +194,7 @@ class PosedViews(Record):
             view = operator.index(index)
             # Not a list, which is copied to the device and waited for.
             return type(self)(*(tensor.select(-3, view).unsqueeze(-3) for tensor in self))
-        return self._replace(
-            K=self.K[..., index, :, :], cam_from_world=self.cam_from_world[..., index, :, :]
-        )
+        return type(self)(*(tensor[..., index, :, :] for tensor in self))
 
     def resize(self, *, old_size: tuple[int, int], new_size: tuple[int, int]) -> Self:
         """The same cameras when their images are resized."""
@@ -242,24 +240,29 @@ class PosedViews(Record):
     def check_values(self) -> None:
         """Raise ``ValueError`` unless K is an upper triangular camera and poses are rigid.
 
-        Call it once where cameras are read. It finds what no operation sees: rotations with a
-        scale, a shear or a mirror, a last row that is not (0, 0, 0, 1), K with zeros or negative
-        focal lengths, transposed or not scaled to K[2, 2] = 1, NaN and infinity; and the shapes
-        of :meth:`check_shapes`. Apart from the operations because looking at values stalls an
-        accelerator.
+        Call it once where cameras are read: no operation looks at values, as that stalls an
+        accelerator. It names a view and what is wrong: a scale, a shear or a mirror, a last row
+        that is not (0, 0, 0, 1), K transposed or not scaled to K[2, 2] = 1, NaN and infinity.
         """
         try:
             self.check_shapes()
         except TypeError as error:
             raise ValueError(str(error)) from error
-        focal = self.K.diagonal(dim1=-2, dim2=-1)[..., :2]
-        lower = torch.stack([self.K[..., 1, 0], self.K[..., 2, 0], self.K[..., 2, 1]])
-        if not bool(self.K.isfinite().all()) or not bool((focal > 0).all()):
-            raise ValueError("K must be finite with positive focal lengths")
-        if bool((lower != 0).any()) or bool((self.K[..., 2, 2] != 1).any()):
-            raise ValueError("K must be upper triangular with K[2, 2] = 1")
-        if not bool(is_rigid(self.cam_from_world).all()):
-            raise ValueError("cam_from_world must hold finite rigid transforms (R orthogonal)")
+        K, pose = self
+        lower = torch.stack([K[..., 1, 0], K[..., 2, 0], K[..., 2, 1], K[..., 2, 2] - 1], dim=-1)
+        off = (pose[..., 3, :].float() - torch.eye(4, device=pose.device)[3]).abs()
+        det = torch.linalg.det(pose[..., :3, :3].float().nan_to_num())
+        for wanted, good in (
+            ("K must be finite", K.isfinite().all(-1)),
+            ("K must have positive focal lengths", K.diagonal(dim1=-2, dim2=-1)[..., :2] > 0),
+            ("K must be upper triangular with K[2, 2] = 1", lower == 0),
+            ("cam_from_world must be finite", pose.isfinite().all(-1)),
+            ("cam_from_world must be rigid, with the last row 0 0 0 1", off <= 1e-3),
+            ("cam_from_world must be rigid, no mirror", det[..., None] > 0),
+            ("cam_from_world must be rigid, R orthogonal, no scale", is_rigid(pose)[..., None]),
+        ):
+            if not bool(good.all()):
+                raise ValueError(f"{wanted}: not so in view {int((~good).nonzero()[0, -2])}")
 
 
 def finite_views(
@@ -276,9 +279,7 @@ def finite_views(
         ShapeError: as :meth:`PosedViews.check_shapes`.
         TypeError: not posed views.
     """
-    if not isinstance(views, PosedViews):
-        kind = type(views).__name__
-        raise TypeError(f"views must be PosedViews, got {kind}: use PosedViews(K, cam_from_world)")
+    check_kind("views", views, PosedViews, "PosedViews(K, cam_from_world)")
     batch = views.check_shapes()
     poses = views.cam_from_world
     poses, posed = finite_or_zero(poses, dims=2, limit=torch.finfo(poses.dtype).max ** 0.25)

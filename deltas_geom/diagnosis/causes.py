@@ -11,6 +11,7 @@ class Cause(Enum):
 
     ALL_WELL = "cameras and matches agree"
     TOO_FEW_MATCHES = "no two views have 8 matches: nothing can be told"
+    PIXELS_NORMALIZED = "pixels are normalised, next to (0, 0)"
     NO_BASELINE = "without a baseline there is no depth"
     POSES_INVERTED = "poses are camera-to-world in the place of world-to-camera"
     OPENGL_WORLD_FROM_CAM = "poses are camera-to-world with OpenGL's axes (y up, z backward)"
@@ -21,6 +22,7 @@ class Cause(Enum):
     K_TRANSPOSED = "K is transposed"
     K_OF_OTHER_SIZE = "K is of images of another size"
     HALF_A_PIXEL = "pixels and K differ by half a pixel: centres at 0.5 met centres at 0"
+    CROPPED = "pixels are of images cropped since K, or its centre is shifted"
     AXES_SWAPPED = "pixels are (row, column) in the place of (x, y)"
     VIEWS_SWAPPED = "the pixels of two views are exchanged"
     POINTS_AS_VIEWS = "pixels are (N, V, 2) in the place of (V, N, 2)"
@@ -32,6 +34,7 @@ class Cause(Enum):
 CURES: dict[Cause, str] = {
     Cause.ALL_WELL: "nothing to do",
     Cause.TOO_FEW_MATCHES: "give more matches, or views that overlap",
+    Cause.PIXELS_NORMALIZED: "multiply by K (cv2.undistortPoints: P=K), or by the image's size",
     Cause.NO_BASELINE: "take pictures from other places, or find the lost translations",
     Cause.POSES_INVERTED: "PosedViews.from_world_from_cam(K, poses)",
     Cause.OPENGL_WORLD_FROM_CAM: "PosedViews.from_opengl(K, poses)",
@@ -47,6 +50,7 @@ CURES: dict[Cause, str] = {
     Cause.K_TRANSPOSED: "PosedViews(K.mT, poses)",
     Cause.K_OF_OTHER_SIZE: "views.resize(old_size=size_of_K, new_size=size_of_images)",
     Cause.HALF_A_PIXEL: "add the shift to pixels, or take it from the centres in K",
+    Cause.CROPPED: "views.crop(left=left, top=top)",
     Cause.AXES_SWAPPED: "pixels.flip(-1)",
     Cause.VIEWS_SWAPPED: "exchange the pixels, or the cameras, of the two views",
     Cause.POINTS_AS_VIEWS: "pixels.transpose(0, 1)",

@@ -5,10 +5,10 @@ from torch import Tensor
 
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import ShapeError, check_batch, check_bool, check_positive
+from deltas_geom.checks import ShapeError, check_batch, check_bool, check_kind, check_positive
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
-from deltas_geom.diagnosis.hypotheses import Hypothesis, resized
+from deltas_geom.diagnosis.hypotheses import Hypothesis, pixels_at, resized, shifted
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.telling import Told
 from deltas_geom.diagnosis.trials import Trial, all_trials, by_camera, explains, level, tried
@@ -22,8 +22,8 @@ def diagnose(
     """Which single cause explains best why matches do not fit the cameras, and its cure.
 
     Poses inverted or with OpenGL's axes, rotations or K transposed, K of images of another size,
-    half a pixel, axes or views of pixels exchanged, one camera with another unit, or one that
-    disagrees with all others: each is mended in turn, for all cameras and for the worst, and the
+    half a pixel, a crop, axes or views of pixels exchanged, one camera with another unit, or one
+    that disagrees with all others: each is mended in turn, for all cameras and for the worst, and
     residuals are compared. They are distances in px of matches from what a view sees of another
     view's ray, which ends at the epipole and at infinity, so that points behind cameras count as
     wrong; a quarter of the matches of a pair of views must fit. So up to 30 % of the pixels may be
@@ -71,6 +71,9 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
     told = Told(views, pixels, seen, given, by_camera(given.residual, evidence, len(K)))
     if not len(evidence.pairs):
         return told.says(Hypothesis(Cause.TOO_FEW_MATCHES, (), None, K, pose))
+    if float(where[seen].abs().median()) < min(2.0, float(K[:, 0, 0].abs().median()) / 50):
+        what = Hypothesis(Cause.PIXELS_NORMALIZED, (), None, K, pose)
+        return told.says(what, tried(what, gather_evidence(pixels_at(where, K), seen)))
     trials = list(all_trials(given, evidence, where, seen, threshold))
     chosen = _chosen(given, trials, evidence, threshold)
     ranked = sorted([given, *trials], key=lambda trial: float(trial.residual.mean()))
@@ -92,16 +95,11 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
 
 def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: float) -> Tensor:
     """``(V, N)`` what is observed and finite."""
-    views.check_shapes()
-    batch = check_batch(
-        K=(views.K, "V 3 3"),
-        cam_from_world=(views.cam_from_world, "V 4 4"),
-        pixels=(pixels, "V N 2"),
-        mask=(mask, "V N"),
-    )
-    check_bool(mask=mask)
-    if batch:
+    check_kind("views", views, PosedViews, "PosedViews(K, cam_from_world)")
+    seen = {"pixels": (pixels, "V N 2"), "mask": (mask, "V N")}
+    if views.check_shapes() or check_batch(K=(views.K, "V 3 3"), **seen):
         raise ShapeError("diagnose takes one set of views: no batch dims")
+    check_bool(mask=mask)
     if views.num_views < 2:
         raise ShapeError(f"diagnose needs 2 views or more, got {views.num_views}")
     check_positive(threshold=threshold)
@@ -172,6 +170,7 @@ def _without_cause(
     if not _well(given.residual, evidence, len(K), threshold):
         return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
     trials = [trial for trial in trials if not trial.what.cameras]
+    trials.append(tried(Hypothesis(Cause.CROPPED, (), None, shifted(K, 20.0), pose), evidence))
     for factor in (0.5, 2.0):
         what = Hypothesis(Cause.K_OF_OTHER_SIZE, (), factor, resized(K, factor), pose)
         trials.append(tried(what, evidence))

@@ -67,6 +67,11 @@ def resized(K: Tensor, factor: float) -> Tensor:
     return half.to(K) @ K
 
 
+def pixels_at(slopes: Tensor, K: Tensor) -> Tensor:
+    """``(V, N, 2)`` pixels of normalised ones."""
+    return (to_homogeneous(slopes) @ K.mT)[..., :2]
+
+
 def of_all(K: Tensor, pose: Tensor, evidence: Evidence) -> Iterator[Hypothesis]:
     """Causes that concern all cameras."""
     yield from _of(K, pose, evidence, slice(None))
@@ -86,6 +91,9 @@ def _of(
 ) -> Iterator[Hypothesis]:
     """Causes that may concern all cameras or one."""
     for cause, mend in MENDS.items():
+        # The transpose of a K with a centre is no camera: it maps all pixels next to one.
+        if cause is Cause.K_TRANSPOSED and bool((K[chosen, :2, 2] != 0).any()):
+            continue
         mended = mend(K[chosen], pose[chosen])
         yield Hypothesis(cause, cameras, None, *replaced(K, pose, chosen, *mended))
     size = best_size(K, pose, evidence, chosen)
@@ -141,8 +149,23 @@ def with_unit(pose: Tensor, camera: int, unit: float) -> Tensor:
     return changed
 
 
-def shifted(K: Tensor, shift: float) -> Tensor:
-    """K with its centre moved by ``shift`` px in x and y."""
+def cropped(K: Tensor, pose: Tensor, evidence: Evidence) -> Hypothesis:
+    """The shift of all centres with the least residuals, by steps to the eight sides."""
+
+    def cost(place: Tensor) -> float:
+        return float(residuals(evidence, shifted(K, place), pose).mean())
+
+    best, step = K.new_zeros(2), 64.0
+    ways = torch.cartesian_prod(*[K.new_tensor([0.0, -1, 1])] * 2)
+    while step > 0.01:
+        nearest = min(best + step * ways, key=cost)
+        step = step / 2 if torch.equal(nearest, best) else step
+        best = nearest
+    return Hypothesis(Cause.CROPPED, (), None, shifted(K, best), pose)
+
+
+def shifted(K: Tensor, shift: float | Tensor) -> Tensor:
+    """K with its centre moved by ``shift`` px in x and y, or by two numbers."""
     moved = K.clone()
     moved[:, :2, 2] += shift
     return moved

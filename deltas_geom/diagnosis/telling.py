@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.diagnosis.causes import CURES, Cause
-from deltas_geom.diagnosis.hypotheses import COMMON_SIZES, Hypothesis
+from deltas_geom.diagnosis.hypotheses import COMMON_SIZES, Hypothesis, pixels_at
 from deltas_geom.diagnosis.results import Diagnosis, Explanation, Mended
 from deltas_geom.diagnosis.trials import Trial, level
 
@@ -64,7 +64,7 @@ class Told(NamedTuple):
         return Diagnosis(
             what.cause,
             self._sentence(what, before, after, moves),
-            _cure(what),
+            _cure(what, self.given.what.K),
             what.cameras[0] if what.cameras else None,
             what.cameras,
             what.factor,
@@ -109,6 +109,8 @@ class Told(NamedTuple):
         order = list(range(len(seen)))
         if what.cause is Cause.POINTS_AS_VIEWS:
             return Mended(views, pixels.transpose(0, 1), seen.mT)
+        if what.cause is Cause.PIXELS_NORMALIZED:
+            return Mended(views, pixels_at(pixels, views.K.to(pixels)), seen)
         if what.cause is Cause.AXES_SWAPPED:
             chosen = list(what.cameras) or order
             pixels = pixels.clone()
@@ -143,8 +145,11 @@ def _by(what: Hypothesis) -> str:
     return f"{unit.get(what.factor, '')} (times {what.factor:.4g} is right)"
 
 
-def _cure(what: Hypothesis) -> str:
+def _cure(what: Hypothesis, K: Tensor) -> str:
     cure = CURES[what.cause]
+    if what.cause is Cause.CROPPED:
+        left, top = (K - what.K)[0, :2, 2].tolist()
+        cure = f"views.crop(left={left:.4g}, top={top:.4g})"
     if what.cause is Cause.K_OF_OTHER_SIZE:
         cure = f"{cure}, the images {what.factor:.4g} times as large as K's"
     if what.cause is Cause.UNIT_OF_TRANSLATION:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.evidence import Evidence, gather_evidence, residuals
-from deltas_geom.diagnosis.hypotheses import Hypothesis, exchanged, of_all, of_one
+from deltas_geom.diagnosis.hypotheses import Hypothesis, cropped, exchanged, of_all, of_one
 from deltas_geom.diagnosis.results import Explanation
 
 _EXACT = 0.02  # px: rounding of float32
@@ -51,8 +51,9 @@ def all_trials(
 ) -> Iterator[Trial]:
     """Everything tried. Single cameras only where some pair is off: that takes longest."""
     K, pose = given.what.K, given.what.pose
-    explained = False
-    for what in _told_apart(of_all(K, pose, evidence)):
+    explained, off = False, float(given.residual.max()) > threshold
+    crop = [cropped(K, pose, evidence)] if off else []
+    for what in [*_told_apart(of_all(K, pose, evidence)), *crop]:
         trial = tried(what, evidence)
         explained |= explains(given, trial, threshold) and bool(
             (trial.residual <= max(threshold, float(given.residual.mean()) / 10)).all()
@@ -65,7 +66,7 @@ def all_trials(
             alike = torch.full_like(given.residual, float(residuals(turned, K, pose).mean()))
             yield Trial(what, alike, given.concerned)
     # What mends all pairs of many cameras is no single camera's.
-    if float(given.residual.max()) <= threshold or (explained and len(K) > 3):
+    if not off or (explained and len(K) > 3):
         return
     worst = by_camera(given.residual, evidence, len(K)).nan_to_num(-1.0).argsort(descending=True)
     few = range(len(K)) if len(K) <= 6 else sorted(worst[: _SUSPECTS + 1].tolist())

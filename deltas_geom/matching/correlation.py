@@ -63,8 +63,8 @@ def correlate(
     """
     check_shapes(
         descriptors=(descriptors, "N D"),
-        feature_map=(feature_map, "S D +h +w"),
-        samples=(samples.pixels, "S N O M 2"),
+        feature_map=(feature_map, "sources D +h +w"),
+        samples=(samples.pixels, "sources N O M 2"),
     )
     check_bool(mask=samples.mask)
     pixels, mask = samples.pixels, samples.mask

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_batch, check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_bool, check_positive, check_shapes
 from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
 from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
     only,
     unless_all,
+    values_at_hand,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -172,8 +173,7 @@ def weights_from_covariance(covariance: Tensor, *, floor: float = 0.5) -> Tensor
         tensor([2.0000, 0.2500])
     """
     check_shapes(covariance=(covariance, "2 2"))
-    if not floor > 0:
-        raise ValueError(f"floor must be positive, got {floor}")
+    check_positive(floor=floor)
     variance = (covariance[..., 0, 0] + covariance[..., 1, 1]) / 2 + floor**2
     known = unless_all(variance.isfinite() & (variance > 0))
     # Double where: the unused branch must not turn the gradient into NaN.
@@ -240,6 +240,10 @@ def match_joint(
     Returns:
         The projections of the one decided depth into the sources that can see it, weight =
         peak of the joint distribution.
+
+    Raises:
+        ValueError: each source has inverse depths of its own; not noticed where values are not on
+            the CPU, or traced.
     """
     check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N 1 M"))
     check_bool(mask=samples.mask)
@@ -248,6 +252,8 @@ def match_joint(
     count = seen.to(scores.dtype).sum(dim=-3)
     mean = safe_divide(only(scores, seen).sum(dim=-3), count, count > 0)
     inv_depth = samples.inv_depth.select(-3, 0)
+    if values_at_hand(inv_depth) and bool((samples.inv_depth != inv_depth.unsqueeze(-3)).any()):
+        raise ValueError("samples must have one inv_depth for all sources: use sample_inv_depths")
     found = soft_argmax(mean, inv_depth[..., None], mask=count > 0, window=window)
     return matches_at(
         views,

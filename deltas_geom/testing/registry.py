@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import wraps
 from typing import Literal
 
@@ -75,7 +76,13 @@ class Invariant:
             self.check(target.checked(), scene, **choices)
 
 
-INVARIANTS: dict[str, Invariant] = {}
+class _ByName(dict[str, Invariant]):
+    def __missing__(self, name: str) -> Invariant:
+        near = get_close_matches(name, self, n=1, cutoff=0.0)
+        raise KeyError(f"no invariant {name!r}: did you mean {near[0]!r}?")
+
+
+INVARIANTS: dict[str, Invariant] = _ByName()
 """Every invariant by name, in the order of the table."""
 
 

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.checks import check_positive
 from deltas_geom.numerics.arithmetic import surely_all
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
@@ -27,6 +28,15 @@ from deltas_geom.triangulation.rig_frame import (
 from deltas_geom.triangulation.weights import weigh
 
 Frame = Literal["rig", "world"]
+FRAMES = ("rig", "world")
+
+
+def check_settings(frame: Frame, max_residual: float | None = None) -> None:
+    """Raise ``ValueError`` where a setting makes no sense."""
+    if frame not in FRAMES:
+        raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+    if max_residual is not None:
+        check_positive(max_residual=max_residual)
 
 
 class Rig(NamedTuple):

@@ -76,6 +76,7 @@ def operation(
     compute, values = partial(computed, True), partial(computed, False)
     *fields, status = recomputed(compute, *inputs, values=values, cut=cut)
     known: dict[str, Any] = dict.fromkeys(record._fields) | dict(zip(names, fields, strict=True))
+    known["parallax"] = known["parallax"].detach()
     found = record(**known | {"status": status, "valid": ok(status)})
     return found if max_residual is None else within_residual(found, max_residual)
 

@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from deltas_geom.checks import check_shapes
 from deltas_geom.numerics.arithmetic import at_least_single, without_autocast
-from deltas_geom.triangulation.equations import Frame
+from deltas_geom.triangulation.equations import Frame, check_settings
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.triangulate import Call, KnownCameras
 
@@ -19,7 +20,8 @@ class PreparedTriangulator:
     """Keeps what depends on the cameras alone; :meth:`Triangulator.prepare` makes it.
 
     Answers and gradients, also those by the cameras, are those of :func:`triangulate`. Cameras that
-    are changed in place are noticed, and looked at anew.
+    are changed in place are noticed, and looked at anew; not so a NumPy array behind ``proj``. It
+    is no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to` moves it.
 
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
@@ -44,6 +46,8 @@ class PreparedTriangulator:
         covariance: bool = False,
         max_residual: float | None = None,
     ) -> None:
+        check_shapes(proj=(proj, "+V 3 4"))
+        check_settings(frame, max_residual)
         self.proj = proj
         self.frame: Frame = frame
         self.covariance = covariance
@@ -94,4 +98,4 @@ def _of_call(
 
 def _version_of(tensor: Tensor) -> int | None:
     """How often it was changed in place; None where torch does not count."""
-    return None if tensor.is_inference() or torch.compiler.is_compiling() else tensor._version
+    return None if torch.compiler.is_compiling() or tensor.is_inference() else tensor._version

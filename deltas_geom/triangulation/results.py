@@ -73,7 +73,7 @@ class Triangulation(Record):
         status: ``(*B, N)`` int8 of :class:`Status`.
         valid: ``(*B, N)`` bool, status is OK.
         residual: ``(*B, N)`` weighted RMS distance of the projections from the pixels, px.
-        parallax: ``(*B, N)`` largest angle between rays of used views, rad.
+        parallax: ``(*B, N)`` largest angle between rays of used views, rad; no gradient.
         covariance: ``(*B, N, 3, 3)`` for pixel noise of standard deviation 1 / weight px, m^2;
             None unless asked for; 0 if not valid, which does not mean exact. It is that of the
             least reprojection error, which one step of :func:`deltas_geom.refine_points` reaches;
@@ -142,7 +142,7 @@ class RobustTriangulation(Record):
         status: ``(*B, N)`` int8 of :class:`Status`.
         valid: ``(*B, N)`` bool, status is OK.
         residual: ``(*B, N)`` weighted RMS distance, px.
-        parallax: ``(*B, N)`` largest angle, rad.
+        parallax: ``(*B, N)`` largest angle, rad; no gradient.
         covariance: ``(*B, N, 3, 3)`` m^2; None unless asked for.
         errors: ``(*B, V, N)`` px, of the inliers.
         inliers: ``(*B, V, N)`` bool, the views used; none if not valid.

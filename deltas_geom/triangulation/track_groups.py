@@ -66,6 +66,16 @@ def check_tracks(
         raise ValueError(f"num_points must not be negative, got {num_points}")
 
 
+def check_range(
+    camera_index: Tensor, point_index: Tensor, num_cameras: int, num_points: int
+) -> None:
+    """Raise ``IndexError`` unless indices are of cameras and points; looks at values."""
+    ends = (("camera_index", camera_index, num_cameras), ("point_index", point_index, num_points))
+    for name, index, count in ends:
+        if len(index) and not 0 <= int(index.min()) <= int(index.max()) < count:
+            raise IndexError(f"{name} must be from 0 to {count - 1}: leave out COLMAP's -1")
+
+
 class Groups(NamedTuple):
     """All points once, and where to find them again.
 
@@ -90,10 +100,7 @@ class Groups(NamedTuple):
 
 def grouped(camera_index: Tensor, point_index: Tensor, num_cameras: int, num_points: int) -> Groups:
     """Points of up to 1, 2, 4, 8 and so on observations are a group, at 1 also those of none."""
-    ends = (("camera_index", camera_index, num_cameras), ("point_index", point_index, num_points))
-    for name, index, count in ends:
-        if len(index) and not 0 <= int(index.min()) <= int(index.max()) < count:
-            raise IndexError(f"{name} must be from 0 to {count - 1}")
+    check_range(camera_index, point_index, num_cameras, num_points)
     point_index = point_index.long()
     # By point, then by camera, so that the order in the list does not count.
     order = (point_index * num_cameras + camera_index).argsort(stable=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 from deltas_geom.triangulation.operation import operation
@@ -31,7 +31,7 @@ from deltas_geom.triangulation.track_equations import (
     summed,
     summed_squares,
 )
-from deltas_geom.triangulation.track_groups import check_tracks
+from deltas_geom.triangulation.track_groups import check_range, check_tracks
 from deltas_geom.triangulation.uncertainty import inverse_information, unscaled
 
 
@@ -111,8 +111,8 @@ def triangulate_tracks(
         ShapeError: a shape differs.
         TypeError: an index is not of integers.
         ValueError: ``num_points`` is negative, or ``max_residual`` not positive.
-        IndexError or RuntimeError: by torch, an index is out of range. (On a GPU torch may tell
-            later, or end the process: check lists of unknown origin before they go there.)
+        IndexError: an index is out of range. (On a GPU torch tells, later, or ends the process:
+            check lists of unknown origin before they go there.)
 
     Source: Hartley and Zisserman, 2nd ed., section 12.2.
 
@@ -134,6 +134,8 @@ def triangulate_tracks(
         'TOO_FEW_VIEWS'
     """
     check_tracks(proj, camera_index, point_index, weights, pixels=pixels, num_points=num_points)
+    if values_at_hand(camera_index) and values_at_hand(point_index):
+        check_range(camera_index, point_index, len(proj), num_points)
     weight = torch.ones_like(pixels[..., 0]) if weights is None else weights
     return operation(
         TriangulatedTracks,

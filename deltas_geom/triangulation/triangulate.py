@@ -8,7 +8,7 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, transformed
-from deltas_geom.triangulation.equations import Frame, Rig, rig_of
+from deltas_geom.triangulation.equations import FRAMES, Frame, Rig, check_settings, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
 from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed
@@ -138,8 +138,8 @@ class Call:
         mask: Tensor | None,
         frame: Frame,
     ) -> None:
-        if frame not in ("rig", "world"):
-            raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
+        if frame not in FRAMES:
+            check_settings(frame)
         proj = known.proj
         self.batch = check_observed(proj, pixels, weights, mask)
         self.tensors: tuple[Any, ...] = (proj, pixels, weights, mask)
@@ -194,8 +194,8 @@ class Call:
         dims = (-2, -1, -1, -1, -1, *([-3] if covariance else []), -1)
         found = self._computed(derivable, values, dims)
         points, depth, residual, parallax, errors, *noise, status = found
-        cov = noise[0] if noise else None
-        return Triangulation(points, depth, status, ok(status), residual, parallax, cov, errors)
+        cov, angle = noise[0] if noise else None, parallax.detach()
+        return Triangulation(points, depth, status, ok(status), residual, angle, cov, errors)
 
     def _computed(
         self, function: Function, values: Function, outputs: tuple[int, ...]

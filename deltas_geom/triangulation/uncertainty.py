@@ -61,7 +61,7 @@ def reprojection_residual(
 
 @without_autocast
 def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
-    """Largest angle between the rays of used views at a point, ``(*B, N)`` rad.
+    """Largest angle between the rays of used views at a point, ``(*B, N)`` rad; no gradient.
 
     Args:
         proj: ``(*B, V, 3, 4)``; cameras of unused views may hold anything.
@@ -184,6 +184,7 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         >>> depth_variance(torch.eye(3, 4)[None], torch.diag(torch.tensor([1.0, 2.0, 9.0]))[None])
         tensor([[9.]])
     """
+    check_tensor(covariance=covariance)  # None: it was not asked for
     check_batch(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
     (cameras, _), work = finite_cameras(proj), solver_dtype(proj)

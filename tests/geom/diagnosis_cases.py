@@ -7,7 +7,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from deltas_geom import PosedViews, diagnose, invert_pose, project
+from deltas_geom import PosedViews, diagnose, invert_pose, project, to_homogeneous
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.testing import intrinsics_per_view, rigid
@@ -101,6 +101,10 @@ def only(camera: int, fault: Fault) -> Fault:
     return planted
 
 
+def rays_of(K: Tensor, pixels: Tensor) -> Tensor:
+    return to_homogeneous(pixels) @ K.inverse().mT
+
+
 def exchanged(K: Tensor, pose: Tensor, pixels: Tensor) -> Capture:
     order = torch.arange(len(K))
     order[[1, 2]] = order[[2, 1]]
@@ -120,6 +124,8 @@ GLOBAL: dict[Cause, Fault] = {
     ),
     Cause.K_TRANSPOSED: lambda K, T, x: (K.mT, T, x),
     Cause.K_OF_OTHER_SIZE: lambda K, T, x: (of_another_size(K, 2.0), T, x),
+    Cause.CROPPED: lambda K, T, x: (K, T, x - torch.tensor([160.0, 120.0])),
+    Cause.PIXELS_NORMALIZED: lambda K, T, x: (K, T, rays_of(K, x)[..., :2]),
     Cause.AXES_SWAPPED: lambda K, T, x: (K, T, x.flip(-1)),
     Cause.VIEWS_SWAPPED: exchanged,
 }

@@ -16,6 +16,7 @@ from diagnosis_cases import (
     diagnosed,
     of_another_size,
     only,
+    rays_of,
     seen_by,
     spoiled,
     with_translation,
@@ -157,6 +158,18 @@ def test_half_a_pixel_is_told_from_exact_matches_alone(capture: Capture) -> None
     noisy = diagnosed((K, pose, spoiled(pixels) + 0.5))
     assert noisy.well
     assert Cause.HALF_A_PIXEL in {other.cause for other in noisy.untold}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_cure_makes_cameras_that_are_none(seed: int) -> None:
+    """A transpose maps all pixels next to one, where nothing is off by much."""
+    views, _, pixels = seeded_scene(seed, num_views=4, num_points=50)
+    for seen in (pixels / 640, 2 * pixels / 640 - 1, rays_of(views.K, pixels)[..., :2]):
+        found = diagnose(views, seen)
+        assert found.cause is Cause.PIXELS_NORMALIZED and "P=K" in found.cure
+    found = diagnose(views, pixels - torch.tensor([60.0, 40.0]))
+    assert found.cause is Cause.CROPPED and "top=40)" in found.cure
+    found.mended.views.check_values()
 
 
 def test_points_in_the_place_of_views_are_noticed() -> None:

@@ -207,6 +207,14 @@ def assert_refused(found: Any, free: Any, outside: Tensor) -> None:
 
 
 @EACH
+def test_parallax_says_that_it_has_no_gradient(name: str) -> None:
+    s = inputs_of(seeded_scene(0, num_views=4, num_points=4))
+    s |= {key: s[key].clone().requires_grad_() for key in ("pixels", "rays")}
+    found = solved(name, s)
+    assert found.points.requires_grad and not found.parallax.requires_grad
+
+
+@EACH
 def test_a_refused_point_has_no_gradient_and_the_others_keep_theirs(name: str) -> None:
     generator = torch.Generator().manual_seed(0)
     poses = torch.eye(4).double().repeat(4, 1, 1)

@@ -22,6 +22,10 @@ K = torch.tensor([[500.0, 0, 655], [0, 510, 470], [0, 0, 1]]).double()
 def test_opencv_projects_to_the_same_pixels(count: int) -> None:
     dist = torch.tensor(DIST[:count]).double()
     lens = Lens.from_opencv(K, dist)
+    for alike in (dist[None], dist[:, None]):  # as calibrateCamera has them
+        assert torch.equal(Lens.from_opencv(K, alike).coefficients, lens.coefficients)
+        many = Lens.from_opencv(K.expand(2, 3, 3), alike.expand(2, *alike.shape))
+        assert undistort_pixels(many, torch.zeros(2, 7, 2)).pixels.shape == (2, 7, 2)
     none = np.zeros(3)
     theirs, _ = cv2.projectPoints(POINTS.numpy(), none, none, K.numpy(), dist.numpy())
     pixels, valid = lens.project(POINTS)
@@ -43,7 +47,7 @@ def test_opencv_fisheye_projects_to_the_same_pixels() -> None:
     theirs, _ = cv2.fisheye.projectPoints(
         POINTS.numpy()[:, None], none, none, K.numpy(), dist.numpy()
     )
-    ours = Lens.from_opencv_fisheye(K, dist).project(POINTS)
+    ours = Lens.from_opencv_fisheye(K, dist[:, None]).project(POINTS)
     assert ours.valid.all()
     assert_close(ours.pixels.numpy(), theirs[:, 0], rtol=0, atol=1e-9)
 

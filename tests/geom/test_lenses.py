@@ -44,6 +44,8 @@ def test_names_and_counts_that_are_wrong_are_told_with_the_right_ones() -> None:
         Lens.from_opencv(K, torch.ones(14))
     with pytest.raises(geom.ShapeError, match="K must have shape"):
         Lens(torch.eye(4), torch.zeros(4), "OPENCV")
+    with pytest.raises(geom.ShapeError, match=r"\(48, 64, 3\): use image.movedim\(-1, -3\)"):
+        geom.undistort_image(Lens(K, torch.zeros(4), "OPENCV"), torch.rand(48, 64, 3))
     with pytest.raises(TypeError, match="coefficients must be"):
         Lens(K, [0.0] * 4, "OPENCV")
 
@@ -283,6 +285,15 @@ def test_numbers_without_sense_are_masked_or_right_and_never_nan(name: str, valu
         assert all(result.isfinite().all() for result in results)
         gradients = torch.autograd.grad(sum(r.sum() for r in results), inputs, allow_unused=True)
         assert not any(g.isnan().any() for g in gradients if g is not None)
+
+
+@EACH
+def test_a_pixel_that_was_not_seen_stays_so(name: str) -> None:
+    lens, odd = ALL[name].lens(), torch.tensor([[math.nan, 1], [1, math.inf], [1e9, 1]]).double()
+    pixels, valid = geom.undistort_pixels(lens, odd.requires_grad_())
+    assert pixels[:2].isnan().all() and pixels[2].isfinite().all() and not valid[:2].any()
+    (slope,) = torch.autograd.grad(pixels[2].sum(), odd)
+    assert slope.isfinite().all()
 
 
 def test_lenses_of_a_batch_broadcast_with_points() -> None:

@@ -20,7 +20,7 @@ from deltas_geom import (
     triangulate,
     weights_from_covariance,
 )
-from deltas_geom.testing import PosedScene, forward_motion
+from deltas_geom.testing import PosedScene, forward_motion, seeded_scene
 from deltas_geom.testing.scenes import IMAGE_SIZE
 from deltas_geom.testing.strategies import extreme, posed_scenes, vectors
 
@@ -127,6 +127,14 @@ def test_joint_matches_triangulate_to_the_depth_that_all_views_prefer(
     depth = torch.where(anyone, found.depth[0], 1 / INV_DEPTHS[place])
     assert_close(depth, (1 / INV_DEPTHS[place]).expand(4), rtol=1e-9, atol=0)
     assert found.valid[anyone].all()
+
+
+def test_joint_matches_take_inverse_depths_of_all_sources_alone() -> None:
+    views, _, pixels = seeded_scene(0, num_views=3, num_points=4)
+    segments = epipolar_segments(views, pixels[0], depth_range=(0.1, 100.0), image_size=IMAGE_SIZE)
+    samples = sample_segments(segments, 8)
+    with pytest.raises(ValueError, match="use sample_inv_depths"):
+        match_joint(views, pixels[0], torch.zeros(2, 4, 1, 8), samples, image_size=IMAGE_SIZE)
 
 
 @given(scene=posed_scenes(num_views=3), scores=vectors(2, within=3.0, size=4 * 31))

@@ -61,6 +61,13 @@ def test_cameras_made_in_inference_mode_are_noticed_too(inputs: Inputs) -> None:
         assert torch.equal(rig.points(pixels, weights), triangulate_points(proj, pixels, weights))
 
 
+def test_it_compiles_to_one_graph() -> None:
+    scene = ring()
+    rig = PreparedTriangulator(scene.views.proj)
+    compiled = torch.compile(rig.points, fullgraph=True, backend="eager")
+    assert_close(compiled(scene.pixels), rig.points(scene.pixels))
+
+
 @pytest.mark.parametrize("kinds", [(0, 1), (1, 0), (1, 1)], ids=str)
 def test_dtypes_are_those_of_one_call(kinds: tuple[int, int]) -> None:
     scene, dtypes = ring(), (torch.float32, torch.bfloat16)

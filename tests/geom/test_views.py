@@ -118,8 +118,16 @@ def test_good_values_pass_and_bad_ones_say_why() -> None:
     ):
         with pytest.raises(ValueError, match=reason):
             PosedViews(K, views.cam_from_world).check_values()
-    with pytest.raises(ValueError, match="rigid"):
-        PosedViews(views.K, 2 * views.cam_from_world).check_values()
+    for row, factor, reason in (
+        (slice(3, 4), 2.0, "last row 0 0 0 1"),
+        (slice(0, 1), -1.0, "no mirror"),
+        (slice(0, 3), 1.3, "no scale"),
+        (slice(0, 3), torch.nan, "finite"),
+    ):
+        poses = views.cam_from_world.clone()
+        poses[1, row] *= factor
+        with pytest.raises(ValueError, match=f"{reason}: not so in view 1"):
+            PosedViews(views.K, poses).check_values()
 
 
 def test_a_scale_in_camera_to_world_rotations_is_found_and_is_one_of_depths() -> None:

@@ -152,6 +152,11 @@ def test_a_wrong_implementation_fails_what_it_should(target: Target) -> None:
     assert failures(target) == {name for name, wrong in FAIL.items() if target.name in wrong}
 
 
+def test_a_name_of_no_invariant_is_told_with_the_nearest() -> None:
+    with pytest.raises(KeyError, match="did you mean 'points_are_finite'"):
+        INVARIANTS["points_are_fnite"]
+
+
 def test_every_invariant_can_fail() -> None:
     assert INVARIANTS.keys() == FAIL.keys()
     assert set().union(*FAIL.values()) == {target.name for target in WRONG}

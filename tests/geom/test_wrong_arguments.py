@@ -1,5 +1,6 @@
 """Arguments of any operation that are empty or of a wrong kind: an answer or an error in words."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -119,5 +120,36 @@ def test_indices_of_tracks_are_integers(kind: torch.dtype) -> None:
     with pytest.raises(TypeError, match="point_index must hold integers"):
         geom.triangulate_tracks(proj, pixels, index, index.to(kind), 2)
     for camera in (index + 1, index - 1):
-        with pytest.raises((IndexError, RuntimeError), match="out of"):
+        with pytest.raises(IndexError, match="camera_index must be from 0 to 1: leave out COLMAP"):
             geom.triangulate_tracks(proj, pixels, camera, index, 2)
+        with pytest.raises(IndexError, match="point_index must be from 0 to 1"):
+            geom.triangulate_tracks(proj, pixels, index, camera, 2)
+
+
+PROJ, PIXELS = torch.eye(3, 4).expand(2, 3, 4), torch.zeros(2, 6, 2)
+POSED = geom.PosedViews(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4))
+OF_OTHER_KIND: dict[str, Callable[[Any], Any]] = {
+    "views must be PosedViews, got Tensor: use PosedViews": lambda g: g.diagnose(PROJ, PIXELS),
+    "proj must be a torch.Tensor, got PosedViews": lambda g: g.Triangulator().prepare(POSED),
+    "proj must be a torch.Tensor, got ndarray": lambda g: g.Triangulator()(PROJ.numpy(), PIXELS),
+    "use proj.float()": lambda g: g.Triangulator().prepare(PROJ.int()),
+    "must have shape (*B, V, 3, 4), got (2, 3, 3)": lambda g: g.PreparedTriangulator(POSED.K),
+    "frame must be 'rig' or 'world', got 'x'": lambda g: g.Triangulator(frame="x"),
+    "max_residual must be positive, got -1": lambda g: g.Triangulator(max_residual=-1),
+    "lens must be Lens, got Tensor: use Lens(": lambda g: g.undistort_pixels(POSED.K, PIXELS),
+    "covariance must be a torch.Tensor": lambda g: g.depth_variance(PROJ, None),
+    "image_size must be (height, width)": lambda g: g.pixel_grid((3, 4, 5)),
+    "depth_range must be (near, far)": lambda g: g.triangulate(PROJ, PIXELS).within_depth(10.0),
+    "samples has sources = 1 but feature_map has sources = 2": lambda g: g.correlate(
+        torch.zeros(6, 8),
+        torch.zeros(2, 8, 5, 5),
+        g.sample_inv_depths(POSED, PIXELS[0], torch.ones(3), image_size=SIZE),
+        image_size=SIZE,
+    ),
+}
+
+
+@pytest.mark.parametrize("words", OF_OTHER_KIND)
+def test_what_is_of_another_kind_is_an_error_in_words(words: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=re.escape(words)):
+        OF_OTHER_KIND[words](geom)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.lenses.models import MODELS, names_like
-from deltas_geom.cameras.lenses.parameters import from_parameters, opencv, to_parameters
+from deltas_geom.cameras.lenses.parameters import from_parameters, in_a_row, opencv, to_parameters
 from deltas_geom.cameras.lenses.through import pixels_of_points, rays_of_pixels
 from deltas_geom.checks import ShapeError, check_shapes
 from deltas_geom.records import Record
@@ -149,7 +149,7 @@ class Lens:
         Args:
             K: ``(*B, 3, 3)``; OpenCV's pixel centres are at integers, as ours.
             dist: ``(*B, D)`` in OpenCV's order: k1 k2 p1 p2 (k3 (k4 k5 k6 (s1 s2 s3 s4 (tx ty)))),
-                so D is 4, 5, 8, 12 or 14.
+                so D is 4, 5, 8, 12 or 14; OpenCV's own (1, D) and (D, 1) are read as (D).
 
         Raises:
             ShapeError: another number of coefficients.
@@ -169,7 +169,7 @@ class Lens:
         Raises:
             ShapeError: another number of coefficients.
         """
-        return cls(K, dist, "OPENCV_FISHEYE")
+        return cls(K, in_a_row(K, dist), "OPENCV_FISHEYE")
 
     @classmethod
     def from_colmap(cls, model: str, params: Tensor | Sequence[float]) -> Self:

@@ -20,15 +20,19 @@ _OPENCV = {
 _PANORAMA = "EQUIRECTANGULAR"
 
 
+def in_a_row(K: Tensor, dist: Tensor) -> Tensor:
+    """``(*B, D)`` of OpenCV's (1, D) and (D, 1), which no D = 1 and no batch of K explains."""
+    check_shapes(K=(K, "3 3"), dist=(dist, "D"))
+    dist = dist.mT if dist.ndim > 1 and dist.shape[-1] == 1 else dist
+    return dist.squeeze(-2) if dist.ndim > K.ndim - 1 else dist
+
+
 def opencv(K: Tensor, dist: Tensor) -> tuple[Tensor, Tensor, str]:
     """K, coefficients and the model of what OpenCV calls ``distCoeffs``."""
-    check_shapes(K=(K, "3 3"), dist=(dist, "D"))
+    dist = in_a_row(K, dist)
     count = dist.shape[-1]
     if count not in _OPENCV:
-        raise ShapeError(
-            f"dist must have 4, 5, 8, 12 or 14 coefficients, got {tuple(dist.shape)}: "
-            "OpenCV's (1, D) and (D, 1) are dist.flatten()"
-        )
+        raise ShapeError(f"dist must have 4, 5, 8, 12 or 14 coefficients, got {tuple(dist.shape)}")
     if count == 14 and bool((dist[..., 12:] != 0).any()):
         raise ValueError("the tilt of the sensor, tx and ty, must be 0: no model here has one")
     model, wanted = _OPENCV[count]

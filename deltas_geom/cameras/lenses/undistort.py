@@ -12,12 +12,13 @@ from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.lenses.lens import Lens, LensPixels
 from deltas_geom.cameras.pixels import in_image, normalize_pixels, pixel_grid
 from deltas_geom.cameras.projection import pixel_rays
-from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.checks import ShapeError, batch_shape, check_image_size, check_kind, check_shapes
 from deltas_geom.numerics.arithmetic import (
     finite_or_zero,
     numbers_or_zero,
     only,
     surely_all,
+    unless_all,
     without_autocast,
 )
 from deltas_geom.records import Record
@@ -53,7 +54,8 @@ def undistort_pixels(lens: Lens, pixels: Tensor, new_K: Tensor | None = None) ->
 
     Returns:
         Not valid are pixels of no ray (:meth:`Lens.unproject`), or of one that a pinhole camera
-        cannot see, 90 degrees or more off its axis.
+        cannot see, 90 degrees or more off its axis; they are (0, 0), but NaN where a pixel or lens
+        is not finite.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
@@ -64,6 +66,7 @@ def undistort_pixels(lens: Lens, pixels: Tensor, new_K: Tensor | None = None) ->
         >>> undistort_pixels(lens, torch.tensor([[306.25, 120.0]])).pixels
         tensor([[310., 120.]])
     """
+    check_kind("lens", lens, Lens, "Lens(K, coefficients, model)")
     new_K = lens.K if new_K is None else new_K
     check_shapes(new_K=(new_K, "3 3"))
     return LensPixels(*_straightened(lens.K, lens.coefficients, lens.model, pixels, new_K))
@@ -74,8 +77,14 @@ def _straightened(
     K: Tensor, coefficients: Tensor, model: str, pixels: Tensor, new_K: Tensor
 ) -> tuple[Tensor, Tensor]:
     rays, valid = Lens(K, coefficients, model).unproject(pixels)
-    pixels, ahead = Lens(new_K, new_K.new_zeros(0), "PINHOLE").project(rays)
-    return only(pixels, valid.unsqueeze(-1)), ahead & valid
+    straight, ahead = Lens(new_K, new_K.new_zeros(0), "PINHOLE").project(rays)
+    straight = only(straight, valid.unsqueeze(-1))
+    # For a triangulation without the mask: a wrong pixel would be believed.
+    cameras = (x.unsqueeze(-2) for x in (K.flatten(-2), coefficients, new_K.flatten(-2)))
+    for part in (pixels, *cameras):
+        finite = unless_all(part.isfinite().all(dim=-1, keepdim=True))
+        straight = only(straight, finite, other=torch.nan)
+    return straight, ahead & valid
 
 
 def undistort_image(
@@ -115,7 +124,10 @@ def undistort_image(
         >>> bool(undistorted.mask.all())
         True
     """
+    check_kind("lens", lens, Lens, "Lens(K, coefficients, model)")
     check_shapes(image=(image, "C H W"))
+    if image.shape[-1] <= 4 < image.shape[-3]:
+        raise ShapeError(f"image ends in channels, {tuple(image.shape)}: use image.movedim(-1, -3)")
     if not 0 <= alpha <= 1:
         raise ValueError(f"alpha must be from 0 (all seen) to 1 (all kept), got {alpha}")
     old_size = (image.shape[-2], image.shape[-1])
