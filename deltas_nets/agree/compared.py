@@ -22,7 +22,7 @@ STEPS = (-2.5, -1.5, -0.7, 0.0, 0.7, 1.5, 2.5)
 """Depths that are compared, in the spreads below: of the log of depth, around the map's."""
 SHARE = 0.5
 """Of a deviation: the spread within which the depth is sought. See decision 27."""
-LEAST, MOST = 0.005, 0.08
+LEAST, MOST = 0.005, 0.04
 """Spread of the log of depth, at least and at most."""
 SHARPNESS = 20.0
 """What a cosine of one weighs in the log of the likelihood."""
