@@ -20,7 +20,7 @@ from deltas_nets.outputs.atomic_files import write_atomically
 
 __all__ = ["read_scene_cached"]
 
-VERSION = 5
+VERSION = 6
 """Raised whenever the same files give another scene."""
 WORDS = ("ids", "images", "depths")
 
@@ -112,6 +112,7 @@ def _camera(
     lens: list[Any] | None,
     depth_scale: float,
     cam_from_depth: list[list[float]] | None,
+    depth_unit: float,
 ) -> Camera:
     return Camera(
         image_size=(image_size[0], image_size[1]),
@@ -121,6 +122,7 @@ def _camera(
         lens=None if lens is None else Lens(lens[0], tuple(lens[1])),
         depth_scale=depth_scale,
         cam_from_depth=None if cam_from_depth is None else np.array(cam_from_depth),
+        depth_unit=depth_unit,
     )
 
 

@@ -99,7 +99,7 @@ class HeardRooms(Dataset[int]):
 
     @torch.inference_mode()
     def _heard(self, room: PosedImages, random: torch.Generator) -> dict[str, Tensor]:
-        heard = hear_each_other(self._maps(room, random), room.views)
+        heard = hear_each_other(self.maps(room, random), room.views)
         return {
             "images": room.images.contiguous(),
             "depth": heard.depth.half(),
@@ -107,8 +107,8 @@ class HeardRooms(Dataset[int]):
             "truth": room.depth[:, None].half(),
         }
 
-    def _maps(self, room: PosedImages, random: torch.Generator) -> KnownDepth:
-        """A map ``(V, 1, H, W)`` of each view."""
+    def maps(self, room: PosedImages, random: torch.Generator) -> KnownDepth:
+        """A map ``(V, 1, H, W)`` of each view, as the network finds it."""
         size = (room.depth.shape[-2], room.depth.shape[-1])
         one_by_one = [
             self.model.encode(image[None, None].float() / 255).each()[0] for image in room.images
