@@ -94,6 +94,18 @@ def test_images_that_show_nothing_leave_the_map(seed: int) -> None:
     assert compared(found, anchor, []) is found
 
 
+@given(SEEDS)
+def test_an_image_that_does_not_see_a_place_has_no_say(seed: int) -> None:
+    anchor, *others = wall(seed, 1.0, VIEWS)
+    random = torch.Generator().manual_seed(seed)
+    noise = F.normalize(torch.randn(SIZE[0] * SIZE[1], DIM, generator=random), dim=-1)
+    blind = [Described(noise, SIZE, camera(*place)) for place in ((0, 0, 50), (500, 0, 0))]
+    found = maps(1.03, 0.08)
+    expected = compared(found, anchor, others)
+    for part, same in zip(compared(found, anchor, [*blind, *others]), expected, strict=True):
+        torch.testing.assert_close(part, same, rtol=1e-5, atol=0)
+
+
 @given(SEEDS, st.floats(1e-3, 1e3), st.floats(1e-6, 1e4))
 def test_no_map_leaves_what_was_searched(seed: int, far: float, deviation: float) -> None:
     random = torch.Generator().manual_seed(seed)
