@@ -12,7 +12,8 @@ from deltas_geom.numerics.vectors import Symmetric3, Vector3, less, scaled
 def _factor3(normal: Symmetric3) -> tuple[tuple[Tensor, ...], Tensor]:
     """LDL^T: inverse pivots and l10 l20 l21; is the matrix definite beyond rounding?
 
-    A pivot below rounding counts as rounding.
+    A pivot below rounding counts as rounding. Rounding of the matrix changes the last pivot by as
+    much as the last row of L^-1 is long, squared, so that it does not matter which axis comes last.
     """
     a00, a01, a02, a11, a12, a22 = normal
     with torch.no_grad():
@@ -29,7 +30,10 @@ def _factor3(normal: Symmetric3) -> tuple[tuple[Tensor, ...], Tensor]:
     t21 = less(a12, l20, a01)
     l21 = t21 * i1
     d2 = less(less(a22, l20, a02), l21, t21)
-    i2, definite2 = reciprocal(d2)
+    i2, _ = reciprocal(d2)
+    with torch.no_grad():
+        n20 = less(l20, l10, l21)
+        definite2 = d2 > least * (1 + l21.square() + n20.square())
     return (i0, i1, i2, l10, l20, l21), definite0 & definite1 & definite2
 
 
