@@ -18,7 +18,7 @@ from deltas_nets.network.known_depth import KnownDepth
 
 __all__ = ["Described", "compared"]
 
-STEPS = (-2.5, -1.5, -0.7, 0.0, 0.7, 1.5, 2.5)
+STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Depths that are compared, in the spreads below: of the log of depth, around the map's."""
 SHARE = 0.5
 """Of a deviation: the spread within which the depth is sought. See decision 27."""
@@ -136,13 +136,15 @@ def _cosines(
         z: depth.
     """
     height, width = other.size
-    per_depth = 1 / z.clamp_min(NEAREST)
+    per_depth = z.clamp_min(NEAREST).reciprocal_()
     x, y = x * per_depth, y * per_depth
-    inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5) & (z > NEAREST)
-    left, upper = x.floor().clamp(0, width - 2), y.floor().clamp(0, height - 2)
-    right, lower = (x - left).clamp(0, 1), (y - upper).clamp(0, 1)
-    first = (upper * width + left).long()
-    places = torch.stack([first, first + 1, first + width, first + width + 1], dim=-1)
+    # The depths of a pixel lie on a segment: what is true of its ends is true of all.
+    ends = [torch.stack([part[:, 0], part[:, -1]]) for part in (x, y, z)]
+    inside = _within(ends[0], width) & _within(ends[1], height) & (ends[2] > NEAREST)
+    left, upper = x.floor().clamp_(0, width - 2), y.floor().clamp_(0, height - 2)
+    right, lower = x.sub_(left).clamp_(0, 1), y.sub_(upper).clamp_(0, 1)
+    first = upper.mul_(width).add_(left).int()
+    places = first[..., None] + torch.tensor([0, 1, width, width + 1]).to(first)
     shares = torch.stack(
         [(1 - right) * (1 - lower), right * (1 - lower), (1 - right) * lower, right * lower], dim=-1
     )
@@ -151,4 +153,8 @@ def _cosines(
         places.view(-1, 4), other.rows, per_sample_weights=shares.view(-1, 4), mode="sum"
     )
     cosine = torch.bmm(read.view(*x.shape, -1), rows[..., None])[..., 0]
-    return cosine, inside.all(dim=-1)
+    return cosine, inside[0] & inside[1]
+
+
+def _within(at: Tensor, size: int) -> Tensor:
+    return (at > -0.5) & (at < size - 0.5)

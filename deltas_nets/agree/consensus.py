@@ -10,8 +10,8 @@ LEAST = 3
 TOLERANCE = 0.08
 """By which the log of their depth may differ."""
 PIXELS = 1 << 13
-NOWHERE = 1e6
-"""Log depth of what is unknown."""
+TINY = 1e-37
+"""Stands for a depth that is unknown: nothing that is known is near it."""
 ASKED = 13
 """Maps that others agree with or not: the anchor's own and those that share most with it."""
 SUREST = 0.01
@@ -43,21 +43,40 @@ def consensus(maps: KnownDepth) -> KnownDepth:
 
 def _of_pixels(depth: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
     """The consensus ``(N,)`` of maps ``(V, N)``, and its deviation."""
-    known = depth > 0
-    # What is unknown agrees with nothing that is known.
-    log_depth = torch.where(known, depth.log(), NOWHERE)
-    say = torch.where(known, precision(deviation), 0.0)
-    summed = torch.stack([say, say * log_depth, torch.ones_like(say)])
-    best, mean = torch.zeros_like(depth[0]), torch.zeros_like(depth[0])
-    for said in log_depth[:ASKED]:
-        agree = ((log_depth - said).abs_() < TOLERANCE).to(depth)
-        total, weighted, count = (summed * agree).sum(dim=1)
-        better = (count >= LEAST) & (total > best)
-        best = torch.where(better, total, best)
-        mean = torch.where(better, weighted / total.clamp_min(1e-9), mean)
-    near = say * ((log_depth - mean).abs() < TOLERANCE)
-    total = near.sum(dim=0).clamp_min(1e-9)
-    spread = (near * (log_depth - mean).square()).sum(dim=0) / total
-    usual = (near > 0).sum(dim=0) / total
-    found = best > 0
+    # Ones and zeros rather than bools, and no log of 0: each takes several times as long.
+    known = depth.sign()
+    log_depth = depth.clamp_min(TINY).log()
+    say = precision(deviation) * known
+    centre, followers = _surest(log_depth[:1], log_depth, say)
+    # Mostly all agree with the first map: nobody has more followers.
+    left = (followers < known.sum(dim=0)).nonzero()[:, 0]
+    centre[left] = _surest(log_depth[:ASKED, left], log_depth[:, left], say[:, left])[0]
+    off, near, total = _near(log_depth - centre, say)
+    mean = centre + (near * off).sum(dim=0) / total
+    off, near, total = _near(log_depth - mean, say)
+    spread = (near * off.square()).sum(dim=0) / total
+    usual = near.sign().sum(dim=0) / total
+    found = centre < torch.inf
     return torch.where(found, mean.exp(), 0.0), torch.where(found, (usual + spread).sqrt(), 0.0)
+
+
+def _surest(asked: Tensor, log_depth: Tensor, say: Tensor) -> tuple[Tensor, Tensor]:
+    """Of maps ``(A, N)`` the log depth ``(N,)`` whose followers are surest, and how many follow.
+
+    Infinity and 0 where too few do.
+    """
+    total, count = torch.zeros_like(asked), torch.zeros_like(asked)
+    for said, worth in zip(log_depth, say, strict=True):
+        agree = (asked - said).abs_().lt_(TOLERANCE)
+        total.addcmul_(agree, worth)
+        count += agree
+    best, which = torch.where(count >= LEAST, total, 0.0).max(dim=0)
+    centre, followers = (part.gather(0, which[None])[0] for part in (asked, count))
+    enough = best > 0
+    return torch.where(enough, centre, torch.inf), torch.where(enough, followers, 0.0)
+
+
+def _near(off: Tensor, say: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How far maps are off, what those within the tolerance say, and the sum of that."""
+    near = off.abs().lt_(TOLERANCE).mul_(say)
+    return off, near, near.sum(dim=0).clamp_min_(1e-9)

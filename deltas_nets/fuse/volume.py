@@ -28,6 +28,7 @@ BATCH = 63
 """Blocks that are projected at once. What is computed of them stays in the cache, and no operation
 is long enough for torch to start threads for it, which spin beside a busy neighbour."""
 NEAREST = 1e-6  # of depth; what is nearer to a camera, or behind it, it does not see
+FAR = 1e20  # farther than any depth and truncation
 AROUND = 1.75
 """Voxels around a seen point whose blocks are there too, so that cubes at the surface are whole."""
 
@@ -146,8 +147,8 @@ class _Seen:
             offsets: ``(3, VOXELS)`` the voxels from there.
             truncation: as of the volume.
         """
-        z = corners[2, :, None] + offsets[2]
-        per_depth = z.clamp_min(NEAREST).reciprocal_()
+        z = F.threshold(corners[2, :, None] + offsets[2], NEAREST, FAR)
+        per_depth = z.reciprocal()
         # A pixel's centre is 1 in the border, and whole numbers are cut off, not rounded.
         column = (corners[0, :, None] + offsets[0]).mul_(per_depth).add_(1.5)
         row = (corners[1, :, None] + offsets[1]).mul_(per_depth).add_(1.5)
@@ -156,9 +157,9 @@ class _Seen:
         depth = self.depth.index_select(0, pixel).view_as(z)
         distance = (depth - z).mul_(1 / truncation)
         # Nothing is said in front of the truncation either: a map that sees through a surface
-        # would outvote many that see it.
-        seen = ((distance.abs() < 1) & (depth > 0) & (z > NEAREST)).float()
-        weight = self.weight.index_select(0, pixel).view_as(z).mul_(seen)
+        # would outvote many that see it. Ones and zeros: bools take several times as long.
+        seen = distance.abs().lt_(1)
+        weight = self.weight.index_select(0, pixel).view_as(z).mul_(seen)  # 0 without depth
         slab[0].index_add_(0, slots, weight)
         slab[1].index_add_(0, slots, distance.mul_(weight))
         for sums, color in zip(slab[2:], self.colors, strict=True):

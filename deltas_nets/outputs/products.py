@@ -19,6 +19,7 @@ from deltas_nets.outputs.depth_formats import (
     DEPTH_FORMATS,
     MAX_STEPS,
     MILLIMETRES,
+    RUNS,
     DepthFormatName,
     read_depth_png,
     write_depth_png,
@@ -187,7 +188,7 @@ def write_confidence_png(path: Path, probability: ArrayLike) -> None:
     """Write probabilities ``(H, W)`` in [0, 1] as 8-bit 0..255; NaN becomes 0."""
     values = np.nan_to_num(np.asarray(probability, dtype=np.float64), nan=0.0).clip(0, 1)
     image = Image.fromarray(np.rint(255 * values).astype(np.uint8))
-    write_atomically(path, lambda file: image.save(file, format="PNG"))
+    write_atomically(path, lambda file: image.save(file, format="PNG", compress_type=RUNS))
 
 
 def write_points_ply(path: Path, points: ArrayLike, colors: ArrayLike) -> None:

@@ -5,7 +5,6 @@ little elsewhere. The image shows where they are.
 """
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_nets.network.features import Channels, Features
@@ -55,8 +54,15 @@ def kept_at_large(log_depth: Tensor, agreed: Tensor) -> Tensor:
 
 
 def _around(image: Tensor) -> Tensor:
-    # Along one axis and then the other: a square of 41 pixels at once costs 20 times as much.
-    for window in ((WINDOW, 1), (1, WINDOW)):
-        reach = (window[0] // 2, window[1] // 2)
-        image = F.avg_pool2d(image, window, stride=1, padding=reach, count_include_pad=False)
+    """The mean over the square around each pixel, as much of it as lies within ``(B, 1, H, W)``."""
+    # Differences of running sums: F.avg_pool2d of such windows takes 10 ms, a sixth of the stage.
+    for axis in (-2, -1):
+        size = image.shape[axis]
+        sums = image.cumsum(dim=axis, dtype=torch.float64)
+        sums = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums], dim=axis)
+        at = torch.arange(size, device=image.device)
+        first, end = (at - WINDOW // 2).clamp_min(0), (at + WINDOW // 2 + 1).clamp_max(size)
+        total = sums.index_select(axis, end) - sums.index_select(axis, first)
+        count = end - first
+        image = (total / (count if axis == -1 else count[:, None])).to(image.dtype)
     return image
