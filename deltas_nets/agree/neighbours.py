@@ -16,14 +16,16 @@ ACROSS = 8
 
 
 def sample(depth: Tensor, view: PosedViews) -> Tensor:
-    """World points ``(64, 3)`` of a map ``(1, h, w)``, evenly spread; 0 where it has no depth."""
+    """World points ``(64, 3)`` of a map ``(1, h, w)``, evenly spread; NaN where it has no depth."""
     height, width = depth.shape[-2:]
     rows = torch.linspace(0, height - 1, ACROSS + 2)[1:-1].round().long()
     columns = torch.linspace(0, width - 1, ACROSS + 2)[1:-1].round().long()
     at = depth[0, rows[:, None], columns].reshape(1, -1)
     column, row = torch.meshgrid(columns, rows, indexing="xy")
     pixels = torch.stack([column, row], dim=-1).reshape(1, -1, 2).to(view.K)
-    return unproject(view, pixels, at.to(view.K))[0]
+    points = unproject(view, pixels, at.to(view.K))[0]
+    # Of depth 0 the point would be the camera, which others may well see.
+    return torch.where(at[0, :, None] > 0, points, torch.nan)
 
 
 def neighbours(
@@ -46,7 +48,9 @@ def neighbours(
         x, y = found.pixels.unbind(dim=-1)
         width, height = sizes[:, 1, None], sizes[:, 0, None]
         inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        shares.append((inside & found.in_front).double().mean(dim=-1))
+        known = seen.isfinite().all(dim=-1)
+        there = (known & inside & found.in_front).double().sum(dim=-1)
+        shares.append(there / known.sum().clamp_min(1))
     share = torch.stack(shares)
     mutual = torch.minimum(share, share.T).fill_diagonal_(0)
     best, order = mutual.sort(dim=-1, descending=True, stable=True)

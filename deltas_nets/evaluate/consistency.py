@@ -131,15 +131,18 @@ def flicker_of_pair(
 ) -> float | None:
     """Mean difference of the log errors of two maps at the same places; None if these are few.
 
+    Places where either map has no depth do not count, as no error is known there.
+
     Args:
         first: camera, map and true depth of a frame, of one size.
         second: of the next.
     """
     here, there = same_places(first[0], first[2], second[0], second[2])
-    if len(here) < FEWEST:
+    known = (first[1].ravel()[here] > 0) & (second[1].ravel()[there] > 0)
+    if known.sum() < FEWEST:
         return None
     one, other = (_log_error(depth, truth) for _, depth, truth in (first, second))
-    return float(np.abs(one.ravel()[here] - other.ravel()[there]).mean())
+    return float(np.abs(one.ravel()[here] - other.ravel()[there])[known].mean())
 
 
 def same_places(

@@ -74,6 +74,8 @@ def write_depth_png(
 def read_depth_png(path: Path, scale: float = MILLIMETRES) -> NDArray[np.float32]:
     """``(H, W)`` float32 metres of a file of `write_depth_png`, 0 where there is none."""
     with Image.open(path) as image:
+        if not image.mode.startswith("I"):
+            raise ValueError(f"16 bits of one channel are expected, got {image.mode}")
         return (np.asarray(image) / np.float64(scale)).astype(np.float32)
 
 
@@ -121,6 +123,12 @@ DEPTH_FORMATS: dict[DepthFormatName, DepthFormat] = {
 """By the suffix of their files."""
 
 
+def _one_channel(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    if depth.ndim != 2:
+        raise ValueError(f"its shape must be (H, W), got {depth.shape}")
+    return depth
+
+
 def read_depth_map(folder: Path, id: str, scale: float) -> NDArray[np.float32]:
     """The map of a frame, in whatever format a folder holds it.
 
@@ -131,7 +139,7 @@ def read_depth_map(folder: Path, id: str, scale: float) -> NDArray[np.float32]:
         file = folder / "depth" / f"{id}.{name}"
         if file.exists():
             try:
-                return kind.read(file, scale)
+                return _one_channel(kind.read(file, scale))
             except (OSError, ValueError, KeyError, SyntaxError, BadZipFile, EOFError) as error:
                 what = f"the depth map cannot be read ({error})"
                 raise UserError(what, file, MAKE_ANEW) from error

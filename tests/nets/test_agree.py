@@ -244,6 +244,22 @@ def test_neighbours_are_those_that_share_most() -> None:
         assert all(own in found[other] for other in near)
 
 
+def test_what_has_no_depth_is_seen_by_nobody() -> None:
+    behind = camera(0.0, -1.0)  # it sees where the other camera stands
+    views = [camera(0.0), behind]
+    empty, half = torch.zeros(1, *SIZE), wall(views[0])[0]
+    half[..., : SIZE[1] // 2] = 0.0
+    cameras = PosedViews(*(torch.cat(parts) for parts in zip(*views, strict=True)))
+
+    def shared(first: Tensor, second: Tensor) -> list[list[int]]:
+        points = torch.stack([sample(first, views[0]), sample(second, views[1])])
+        return neighbours(points, cameras, [SIZE] * 2)
+
+    whole = wall(behind)[0]
+    assert shared(half, whole) == [[1], [0]]
+    assert shared(empty, whole) == shared(half, empty) == shared(empty, empty) == [[], []]
+
+
 @pytest.mark.parametrize("size", [(24, 32), (40, 91)])
 def test_samples_lie_on_what_the_map_shows(size: tuple[int, int]) -> None:
     points = sample(torch.full((1, *size), 2.0), camera(0.7, 0.4))

@@ -1,6 +1,7 @@
 """`deltas depth` of captures without metres, through lenses, in formats of floats."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import save_capture
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.commands.depth import Depth
+from deltas_nets.errors import UserError
 from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map, read_depth_png
 from deltas_nets.outputs.their_capture import made_of
 from deltas_nets.predict.depth_map import PredictConfig
@@ -135,3 +137,14 @@ def test_formats_hold_what_they_can(tmp_path: Path, name: Any) -> None:
     read = read_depth_map(tmp_path, "7", 1000)
     assert read.dtype == np.float32 and np.allclose(read, depth, atol=0.0006)
     assert name == "png" or np.array_equal(read, depth)
+
+
+def test_a_file_that_is_no_map_of_depth_is_named(tmp_path: Path) -> None:
+    depth, bytes_ = np.ones((1, 2, 3), np.float32), np.ones((2, 3), np.uint8)
+    (tmp_path / "depth").mkdir()
+    np.savez(tmp_path / "depth" / "stacked.npz", depth=depth)
+    Image.fromarray(bytes_).save(tmp_path / "depth" / "grey.png")
+    Image.fromarray(bytes_).convert("RGB").save(tmp_path / "depth" / "colour.png")
+    for id, said in (("stacked", "(1, 2, 3)"), ("grey", "got L"), ("colour", "got RGB")):
+        with pytest.raises(UserError, match=rf"cannot be read .*{re.escape(said)}.*{id}"):
+            read_depth_map(tmp_path, id, 1000)

@@ -322,6 +322,12 @@ def test_contradictions_are_refused_in_one_line(two_scenes: Path, run: Run, tmp_
         ((a, b, "--scenes", sets), "relative to one folder"),
         ((a, "--view-sets", "none.json"), "none.json"),
         ((a, "--predictions", b, "--num-points", 64), "--predictions"),
+        ((a, "--predictions", b, "--weights", "plane-sweep"), "--weights"),
+        ((a, "--predictions", b, "--work-size", 64, 96), "--work-size"),
+        ((a, "--predictions", b, "--views", 7), "--views"),
+        ((a, "--split", "all"), "--split: it goes with --data scannet"),
+        ((a, "--conditions", "ideal"), "--conditions"),
+        ((a, "--every", 3), "--every"),
         (("--rooms", 1, "--consistency"), "--rooms"),
     ):
         assert_one_line(run("evaluate", *arguments), said)

@@ -1,10 +1,13 @@
 """Maps of one scene that agree, and maps that do not."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from deltas_geom import PosedViews
 from deltas_nets.captures.frame import Frame, Lens
@@ -26,14 +29,20 @@ def frame(room: PosedImages, id: int) -> Frame:
     return Frame(str(id), None, (48, 64), K, pose)  # type: ignore[arg-type]
 
 
-def seen(room: PosedImages, scales: list[float], lens: Lens | None = None) -> SeenMaps:
-    """The maps of a room, each its true depth at some scale."""
+def seen(
+    room: PosedImages,
+    scales: list[float],
+    lens: Lens | None = None,
+    holes: Callable[[tuple[int, ...]], NDArray[np.bool_]] = np.zeros,
+) -> SeenMaps:
+    """The maps of a room, each its true depth at some scale, but in holes."""
     maps = SeenMaps()
     for id, scale in enumerate(scales):
         truth = room.depth[id].numpy()
         given = frame(room, id)
         object.__setattr__(given, "lens", lens)
-        maps.add(given, np.float32(scale) * truth, truth)
+        depth = np.where(holes(truth.shape), 0, np.float32(scale) * truth)
+        maps.add(given, depth, truth)
     return maps
 
 
@@ -89,6 +98,16 @@ def test_a_common_scale_flickers_not_and_changing_ones_do(room: PosedImages) -> 
     assert found.flicker == pytest.approx(np.log(1.2), abs=1e-6)
     assert found.agreement is not None and found.truth is not None
     assert found.agreement < 0.8 * found.truth
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, 1.0])
+def test_holes_do_not_hide_flicker(room: PosedImages, share: float) -> None:
+    random = np.random.default_rng(0)
+    found = seen(room, [1.1, 0.9, 1.1, 0.9], holes=lambda size: random.random(size) < share)
+    if share == 1:
+        assert found.result().flicker is None
+    else:
+        assert found.result().flicker == pytest.approx(np.log(1.1 / 0.9), abs=1e-6)
 
 
 def test_one_map_and_bent_lines_say_nothing(room: PosedImages) -> None:
