@@ -1,7 +1,9 @@
 """A lens that bends lines, straightened for the network, and maps bent back onto the photo."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +34,9 @@ MOST = 1.5
 """Times the usual pixels that the network sees of a wide straight image, so that it is as fine."""
 _ACROSS = 33  # pixels of the photo, along each side, that the straight image is made to hold
 _FINER = 2  # times the wanted size, at which an image is straightened before it is made smaller
+_ENOUGH = 1 << 21  # pixels: of more an image need not be finer than the photo, and takes memory
+_AT_ONCE = 1 << 18  # pixels: what a lens computes of each takes 200 bytes
+_ALONE = Lock()  # threads want the same grid at the same time, of which one is enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,9 @@ class StraightFrame(Frame):
         """Straighten the photo at about the size that is wanted."""
         pixels = self.photo.read_image()
         finer = (_FINER * size[0], _FINER * size[1])
+        if finer[0] * finer[1] > _ENOUGH:
+            at_most = (min(wanted, own) for wanted, own in zip(finer, self.image_size, strict=True))
+            finer = (max(size[0], next(at_most)), max(size[1], next(at_most)))
         share = max(finer[0] / self.image_size[0], finer[1] / self.image_size[1])
         if share < 1:
             height, width = self.photo.image_size
@@ -64,15 +72,17 @@ class StraightFrame(Frame):
     def _straightened(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
         """A photo of any size, as a straight image of any size."""
         given = (pixels.shape[0], pixels.shape[1])
-        image = torch.from_numpy(pixels.copy()).permute(2, 0, 1).float()
-        grid = _grid(
-            _Seen.of(self.photo), given, _Straight(self.K.tobytes(), self.image_size), size
-        )
-        # Cubic: linear between pixels is a blur, which costs matches.
-        seen = F.grid_sample(
-            image[None], grid, mode="bicubic", padding_mode="border", align_corners=False
-        )[0]
-        straightened: NDArray[np.uint8] = seen.round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
+        image = torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float()
+        camera = _Straight(self.K.tobytes(), self.image_size)
+        with _ALONE:
+            grid = _grid(_Seen.of(self.photo), given, camera, size)
+        straightened = np.empty((*size, image.shape[1]), dtype=np.uint8)
+        for rows in _strips(size):
+            # Cubic: linear between pixels is a blur, which costs matches.
+            seen = F.grid_sample(
+                image, grid[:, rows], mode="bicubic", padding_mode="border", align_corners=False
+            )
+            straightened[rows] = seen[0].round_().clamp_(0, 255).byte().permute(1, 2, 0).numpy()
         return straightened
 
 
@@ -114,21 +124,44 @@ def _grid(
     seen: _Seen, photo_size: tuple[int, int], camera: _Straight, size: tuple[int, int]
 ) -> torch.Tensor:
     """``(1, H, W, 2)`` where a straight image of a size reads a photo of another."""
-    rays = pixel_rays(camera.resized(size), pixel_grid(size, dtype=torch.float64))
-    pixels = seen.resized(photo_size).project(rays).pixels
-    return normalize_pixels(pixels, image_size=photo_size).float().reshape(1, *size, 2)
+    lens, K = seen.resized(photo_size), camera.resized(size)
+    grid = torch.empty(1, *size, 2)
+    for rows in _strips(size):
+        pixels = lens.project(pixel_rays(K, _pixels_of(rows, size[1]))).pixels
+        normal = normalize_pixels(pixels, image_size=photo_size)
+        grid[0, rows] = normal.float().view(-1, size[1], 2)
+    return grid
 
 
 @lru_cache(maxsize=2)
 def _places(seen: _Seen, camera: _Straight, size: tuple[int, int]) -> NDArray[np.int64]:
-    rays, valid = seen.resized(size).unproject(pixel_grid(size, dtype=torch.float64))
-    ahead = valid & (rays[:, 2] > 0)
-    x, y, w = (torch.where(ahead[:, None], rays, 0.0) @ camera.resized(camera.image_size).mT).T
-    depth = torch.where(ahead, w, 1.0)
-    column, row = (x / depth).round().long(), (y / depth).round().long()
+    lens, K = seen.resized(size), camera.resized(camera.image_size)
     height, width = camera.image_size
-    inside = ahead & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    return torch.where(inside, row * width + column, -1).reshape(size).numpy()
+    places = np.empty(size, dtype=np.int64)
+    for rows in _strips(size):
+        rays, valid = lens.unproject(_pixels_of(rows, size[1]))
+        ahead = valid & (rays[:, 2] > 0)
+        x, y, w = (torch.where(ahead[:, None], rays, 0.0) @ K.mT).T
+        depth = torch.where(ahead, w, 1.0)
+        column, row = (x / depth).round().long(), (y / depth).round().long()
+        inside = ahead & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        found = torch.where(inside, row * width + column, -1)
+        places[rows] = found.view(-1, size[1]).numpy()
+    return places
+
+
+def _strips(size: tuple[int, int]) -> Iterator[slice]:
+    """The rows of an image, some at a time."""
+    few = max(1, _AT_ONCE // size[1])
+    for start in range(0, size[0], few):
+        yield slice(start, min(start + few, size[0]))
+
+
+def _pixels_of(rows: slice, width: int) -> torch.Tensor:
+    """The pixels ``(N, 2)`` of some rows."""
+    pixels = pixel_grid((rows.stop - rows.start, width), dtype=torch.float64)
+    pixels[:, 1] += rows.start
+    return pixels
 
 
 def lens_of(photo: Frame) -> Lens:
@@ -169,7 +202,8 @@ def pixels_of_photo(frame: StraightFrame, size: tuple[int, int]) -> NDArray[np.i
         ``(H, W)`` places in the flattened straight image; -1 where that does not show it.
     """
     camera = _Straight(frame.K.tobytes(), frame.image_size)
-    return _places(_Seen.of(frame.photo), camera, size)
+    with _ALONE:
+        return _places(_Seen.of(frame.photo), camera, size)
 
 
 def photo_pixels(

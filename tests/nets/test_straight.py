@@ -10,6 +10,7 @@ from PIL import Image
 
 from deltas_geom import Lens as GeomLens
 from deltas_geom.cameras.pixels import pixel_grid
+from deltas_nets.captures import straight as straight_module
 from deltas_nets.captures.frame import Frame, Lens
 from deltas_nets.captures.images import Span
 from deltas_nets.captures.straight import StraightFrame, photo_pixels, pixels_of_photo, straight
@@ -74,6 +75,38 @@ def test_a_straight_image_shows_what_its_rays_see(name: str, tmp_path: Path) -> 
         inside = ((pixels > 2) & (pixels < torch.tensor([125.0, 93.0]))).all(-1).numpy()
         error = np.abs(image - pattern(rays))[inside]
         assert inside.mean() > 0.6 and error.mean() < 1.5 and np.percentile(error, 99) < 8
+
+
+@EACH
+def test_large_images_are_straightened_by_strips(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = straight(photo_of(name, tmp_path))
+    assert isinstance(frame, StraightFrame)
+    most = []
+
+    def seen() -> list[np.ndarray]:
+        straight_module._grid.cache_clear()
+        straight_module._places.cache_clear()
+        return [frame.read_image(), frame.read_resized((50, 70)), pixels_of_photo(frame, SIZE)]
+
+    at_once = seen()
+    project = GeomLens.project
+    monkeypatch.setattr(
+        GeomLens, "project", lambda lens, rays: most.append(len(rays)) or project(lens, rays)
+    )
+    monkeypatch.setattr(straight_module, "_AT_ONCE", 1000)
+    for whole, strips in zip(at_once, seen(), strict=True):
+        assert np.array_equal(whole, strips)
+    assert max(most) <= 1000
+    # What is large is not straightened finer than the photo.
+    usual, size = frame.read_resized(SIZE), frame.image_size
+    monkeypatch.setattr(straight_module, "_ENOUGH", 100)
+    most.clear()
+    straight_module._grid.cache_clear()
+    large = frame.read_resized(SIZE)
+    assert sum(most) == max(size[0], SIZE[0]) * max(size[1], SIZE[1])
+    assert np.abs(large.astype(float) - usual.astype(float)).mean() < 2
 
 
 @EACH
