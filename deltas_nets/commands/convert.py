@@ -66,6 +66,9 @@ class Convert(Command):
             raise UserError("points of which maps?", "--points", "add --depths DIR")
         if self.scale is not None and self.scale_from is not None:
             raise UserError("two scales", "--scale-from", "leave out one of it and --scale")
+        if str(self.depths) == "sensor":
+            what, remedy = "sensor depth is a part of the capture", "leave it out: it is written"
+            raise UserError(what, "--depths sensor", remedy)
 
         from deltas_nets.captures.ids import ids_in_words
         from deltas_nets.captures.saving import doubts_of_images, save_capture

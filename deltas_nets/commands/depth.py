@@ -192,11 +192,18 @@ class Depth(Captured, Measuring, Prediction):
         search: "Search",
         threads: int,
     ) -> "PredictConfig":
-        """With the size at which the network is surest, unless one is given or depth is."""
+        """With the size at which the network is surest, unless one is given or depth is.
+
+        A folder that has maps keeps what was chosen for them.
+        """
+        from deltas_nets.outputs.summary import recorded_pixels
         from deltas_nets.predict.trial import TRIED, surest_config
 
         if self.work_size is not None or self.views == 1 or self.sensor_depth is not None:
             return config
+        known = None if self.overwrite else recorded_pixels(self.folder)
+        if known is not None:
+            return replace(config, work_pixels=known)
         count = min(TRIED, len(view_sets))
         with progress("size of images", count) as report:
             found = surest_config(

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 
 from deltas_nets.commands.flags import Flag, Prediction, usable_device
+from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
@@ -121,26 +122,20 @@ class Evaluate(Prediction):
         if self.predictions is not None and self.settings.given():
             what = "maps are there already, whatever the settings"
             raise UserError(what, "--predictions", "leave it out, or the settings")
-        self._check_used()
-
-    def _check_used(self) -> None:
-        """Refuse flags that nothing would come of: what they ask for is not what is scored."""
-        recorded = self.view_sets is None and self.protocol == "chosen"
-        scored = self.predictions is not None
-        unused = {
-            "split": ("--data scannet", self.data is None),
-            "conditions": ("--rooms", self.rooms is None),
-            "every": ("--protocol paper", self.protocol != "paper"),
-            "views": ("--view-sets or --protocol", scored and recorded),
-        } | {
-            name: ("no --predictions, whose maps are there already", scored)
-            for name in ("weights", "precision", "work_size")
-        }
-        usual = {field.name: field.default for field in fields(self)}
-        for name, (wanted, is_unused) in unused.items():
-            if is_unused and getattr(self, name) != usual[name]:
-                flag = f"--{name.replace('_', '-')}"
-                raise UserError("the flag is of no use here", flag, f"it goes with {wanted}")
+        there = None if self.predictions is None else "no --predictions, as their maps are there"
+        recorded = there and self.view_sets is None and self.protocol == "chosen"
+        refuse_unused(
+            self,
+            {
+                "split": "--data scannet" if self.data is None else None,
+                "conditions": "--rooms" if self.rooms is None else None,
+                "every": "--protocol paper" if self.protocol != "paper" else None,
+                "views": "--view-sets or --protocol" if recorded else None,
+                "weights": there,
+                "precision": there,
+                "work_size": there,
+            },
+        )
 
     def _of_scenes(self) -> tuple["DatasetScores", str]:
         from deltas_nets.evaluate.dataset import evaluate_scenes

@@ -9,6 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.depth_telling import show_fused
 from deltas_nets.commands.flags import Flag, folder_for, opened, sensible
+from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import counted, progress, warn
 
@@ -82,12 +83,20 @@ class Fuse(Command):
         if out.resolve() == self.capture.resolve():
             what = "the output folder is the capture itself"
             raise UserError(what, out, "name another folder with --out")
+        sensor = "maps, as sensor depth states no confidence" if self._of_sensor else None
+        alone = None if self.consistency else "maps that are compared, without --no-consistency"
+        unused = {"min_confidence": sensor, "neighbours": alone, "least": alone}
+        refuse_unused(self, unused)
         capture = opened(self.capture, self.intrinsics)
         # Maps know theirs, to the last digit, as their cameras are known by a hash.
-        if self.scale is not None and str(self.depths) == "sensor":
+        if self.scale is not None and self._of_sensor:
             capture = in_metres(capture, self.scale)
         self.fuse(capture, out)
         show_fused(capture, self.depths, out)
+
+    @property
+    def _of_sensor(self) -> bool:
+        return str(self.depths) == "sensor"
 
     def fuse(self, capture: "Capture", out: Path) -> None:
         """Fuse maps of a capture that is open."""

@@ -160,6 +160,7 @@ CHECKS: Mapping[str, Callable[[Any, str], object]] = {
     "scale": _positive,
     "depth_scale": _positive,
     "min_confidence": _part,
+    "memory": positive,
     "capture": _capture,
     "scale_from": _depths,
     "intrinsics": _intrinsics,

@@ -20,6 +20,7 @@ from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
 from deltas_nets.evaluate.truth import Truth, TruthSize
 from deltas_nets.outputs.depth_formats import read_depth_map
 from deltas_nets.outputs.summary import recorded_depth_scale
+from deltas_nets.outputs.their_capture import in_their_unit
 from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, frames_of, resized
 from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
@@ -129,6 +130,7 @@ def evaluate_files(
         UserError: all frames fail, or no anchor has true depth in range.
     """
     scale = recorded_depth_scale(predictions)
+    capture = in_their_unit(capture, predictions)
 
     def read(views: ViewSet) -> _Scored:
         return _Scored(read_depth_map(predictions, views.anchor, scale), None, None)

@@ -94,7 +94,7 @@ class Predicted:
     ) -> None:
         if read_summary(folder / SUMMARY) is None:
             what = "the folder holds no depth maps of deltas depth"
-            raise UserError(what, folder, "run deltas depth first, or write sensor instead")
+            raise UserError(what, folder, "run deltas depth first")
         found = made_of(capture, folder)
         summary = found.summary
         self.capture = found.capture

@@ -124,7 +124,7 @@ DEPTH_FORMATS: dict[DepthFormatName, DepthFormat] = {
 
 
 def _one_channel(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    if depth.ndim != 2:
+    if depth.ndim != 2 or depth.size == 0:
         raise ValueError(f"its shape must be (H, W), got {depth.shape}")
     return depth
 

@@ -63,6 +63,18 @@ def recorded_depth_scale(out: Path) -> float:
     return scale
 
 
+def recorded_pixels(out: Path) -> int | None:
+    """Pixels of the images that the network saw, of a run or shard that filled a folder.
+
+    None if there was none, or if a size was asked for.
+    """
+    shards = sorted(file for file in out.glob("summary.*.json") if SHARD_SUMMARY.match(file.name))
+    summaries = filter(None, map(read_summary, (out / SUMMARY, *shards)))
+    predict = next(summaries, {}).get("settings", {}).get("predict", {})
+    pixels: int | None = predict.get("work_pixels") if predict.get("work_size") is None else None
+    return pixels
+
+
 OPTIONS = {
     "capture": "the capture or one of its cameras",
     "network": "--weights",

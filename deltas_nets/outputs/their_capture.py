@@ -11,7 +11,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.outputs.depth_formats import DEPTH_FORMATS
 from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_view_sets
 
-__all__ = ["METRE", "MadeOf", "made_of", "map_file"]
+__all__ = ["METRE", "MadeOf", "in_their_unit", "made_of", "map_file"]
 
 METRE = "metre"
 
@@ -64,12 +64,27 @@ def map_file(folder: Path, id: str) -> Path | None:
     return next(filter(Path.exists, files), None)
 
 
-def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> Capture:
+def in_their_unit(capture: Capture, folder: Path) -> Capture:
+    """The capture in the unit of a folder's maps, if `deltas depth` made them.
+
+    Args:
+        capture: as it was opened for `deltas depth`, whatever scale it had there.
+        folder: of maps.
+    """
+    return _scaled_as_recorded(capture, read_summary(folder / SUMMARY) or {})
+
+
+def _scaled_as_recorded(capture: Capture, summary: Mapping[str, Any]) -> Capture:
     factor = summary.get("scaled_by", 1.0)
-    if isinstance(factor, int | float) and factor > 0 and factor != capture.scaled_by:
-        metric = summary.get("unit", METRE) == METRE
-        depth = summary.get("depth_scaled_by", 1.0) / capture.depth_scaled_by
-        capture = scaled(capture, factor / capture.scaled_by, depth_factor=depth, metric=metric)
+    if not (isinstance(factor, int | float) and factor > 0 and factor != capture.scaled_by):
+        return capture
+    metric = summary.get("unit", METRE) == METRE
+    depth = summary.get("depth_scaled_by", 1.0) / capture.depth_scaled_by
+    return scaled(capture, factor / capture.scaled_by, depth_factor=depth, metric=metric)
+
+
+def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> Capture:
+    capture = _scaled_as_recorded(capture, summary)
     recorded = summary["settings"].get("capture")
     cameras = recorded.get("cameras") if isinstance(recorded, dict) else None
     if cameras is not None and cameras != capture.fingerprint():

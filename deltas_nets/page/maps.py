@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.beside import fused_files, read_fuse_summary
 from deltas_nets.outputs.confidence_maps import confidence_file, read_confidence
 from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
 from deltas_nets.outputs.products import read_points_ply
 from deltas_nets.outputs.summary import recorded_depth_scale
-from deltas_nets.outputs.their_capture import METRE, made_of, map_file
+from deltas_nets.outputs.their_capture import METRE, made_of
 from deltas_nets.terminal import warn
 
-__all__ = ["Maps", "has_fused", "open_maps"]
+__all__ = ["Maps", "fused_in", "has_fused", "open_maps"]
 
 FUSED = ("mesh.ply", "cloud.ply")
 """What `deltas fuse` writes."""
@@ -61,9 +62,6 @@ class Maps(NamedTuple):
             UserError: the file cannot be read.
         """
         depth = read_depth_map(self.folder, id, self.steps)
-        if depth.ndim != 2 or depth.size == 0:
-            file = map_file(self.folder, id) or self.folder / "depth" / id
-            raise UserError("this is no depth map", file, MAKE_ANEW)
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def confidence(self, id: str) -> NDArray[np.float32] | None:
@@ -97,7 +95,14 @@ class Maps(NamedTuple):
 
 def has_fused(folder: Path) -> bool:
     """Whether a folder holds what the page shows of `deltas fuse`."""
-    return any((folder / name).exists() for name in FUSED)
+    return bool(fused_in(folder))
+
+
+def fused_in(folder: Path) -> list[Path]:
+    """What is fused in a folder, the mesh first; of a folder of `deltas fuse` what that made."""
+    summary = read_fuse_summary(folder)
+    ours = FUSED if summary is None else fused_files(summary)
+    return [folder / name for name in FUSED if name in ours and (folder / name).exists()]
 
 
 def open_maps(capture: Capture, folder: Path, fused: Path | None = None) -> Maps:

@@ -10,7 +10,7 @@ from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.spread import spread
-from deltas_nets.page.maps import FUSED, Maps
+from deltas_nets.page.maps import Maps, fused_in
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
 
 __all__ = [
@@ -102,11 +102,10 @@ def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer
         UserError: a file cannot be read.
     """
     found = []
-    for file in (maps.fused / name for name in FUSED):
-        if file.exists():
-            surface = read_surface(file)
-            most = most_points if surface.faces is None else most_faces
-            found.append(Layer(file.stem, thinned(surface, most)))
+    for file in fused_in(maps.fused):
+        surface = read_surface(file)
+        most = most_points if surface.faces is None else most_faces
+        found.append(Layer(file.stem, thinned(surface, most)))
     return [layer for layer in found if len(layer.surface.xyz)]
 
 

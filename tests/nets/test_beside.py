@@ -14,7 +14,7 @@ from small_output import write_frame
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.outputs.beside import PAGE, PREVIEWS, SHEET, range_of_page
 from deltas_nets.outputs.prepare import prepare_output
-from deltas_nets.page.maps import open_maps
+from deltas_nets.page.maps import fused_in, open_maps
 from deltas_nets.page.write import write_page
 
 FLAT = ("--no-consistency", "--voxel", "0.05")
@@ -156,8 +156,10 @@ def test_a_fusion_takes_no_file_for_its_own_that_it_did_not_write(
     out = tmp_path / "fused"
     assert run("fuse", *filled, "--out", out, "--cloud", *FLAT).code == 0
     (out / "mesh.ply").write_text("mine")
+    assert fused_in(out) == [out / "cloud.ply"]
     refused = run("fuse", *filled, "--out", out, "--mesh", *FLAT)
     assert_one_line(refused, "the file exists", "mesh.ply", "--overwrite")
     assert (out / "mesh.ply").read_text() == "mine"
     assert run("fuse", *filled, "--out", out, "--mesh", *FLAT, "--overwrite").code == 0
     assert (out / "mesh.ply").read_bytes().startswith(b"ply")
+    assert fused_in(out) == [out / "mesh.ply", out / "cloud.ply"]

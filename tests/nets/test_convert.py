@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import MakeCapture
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -222,3 +223,9 @@ def test_images_that_nobody_can_use_are_said(
         image.write_bytes(image.read_bytes()[:content] if isinstance(content, int) else content)
     said = run("convert", tmp_path / "in", tmp_path / "out")
     assert "1 image cannot be used (1)" in said.err and what in said.err and "4 frames" in said.out
+
+
+def test_a_sensor_is_no_folder_of_maps(make_capture: MakeCapture, tmp_path: Path, run: Run) -> None:
+    given = ("convert", make_capture(), tmp_path / "out", "--to", "own", "--depths", "sensor")
+    assert_one_line(run(*given), "--depths sensor")
+    assert not (tmp_path / "out").exists()

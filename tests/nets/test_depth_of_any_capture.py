@@ -22,7 +22,9 @@ from deltas_nets.captures.saving import save_capture
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.commands.depth import Depth
 from deltas_nets.errors import UserError
+from deltas_nets.evaluate.capture import evaluate_files
 from deltas_nets.outputs.depth_formats import DEPTH_FORMATS, read_depth_map, read_depth_png
+from deltas_nets.outputs.summary import recorded_view_sets
 from deltas_nets.outputs.their_capture import made_of
 from deltas_nets.predict.depth_map import PredictConfig
 
@@ -124,7 +126,14 @@ def test_a_scale_is_of_depth_files_and_so_is_one_measured_by_hand(
     )
     for capture, unit in ((stated, 2.0), (found, 2.0), (kept, 1.0)):
         assert capture.metric and capture.frame(1).read_depth().max() == pytest.approx(2.5 * unit)
-        made = made_of(opened, write_maps(capture, tmp_path / f"maps-{id(capture)}")).capture
+
+        def right(size: tuple[int, int], depth: float = 2.5 * unit) -> np.ndarray:
+            return np.full(size, depth)
+
+        maps = write_maps(capture, tmp_path / f"maps-{id(capture)}", depth=right)
+        scores = evaluate_files(maps, opened, recorded_view_sets(maps))
+        assert scores.dense.abs_rel == pytest.approx(0, abs=1e-3)
+        made = made_of(opened, maps).capture
         assert made.fingerprint() == capture.fingerprint()
         assert made.frame(1).read_depth().max() == pytest.approx(2.5 * unit)
 

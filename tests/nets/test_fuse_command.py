@@ -305,6 +305,24 @@ def test_a_file_of_somebody_else_is_not_replaced(
     assert (tmp_path / "mesh.ply").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--memory", 0), "--memory 0"),
+        (("--memory", "nan"), "--memory nan"),
+        (("--no-consistency", "--least", 3), "--least"),
+        (("--no-consistency", "--neighbours", 4), "--neighbours"),
+    ],
+)
+def test_flags_that_nothing_would_come_of_are_refused(
+    maps: tuple[Path, Path], tmp_path: Path, run: Run, flags: tuple[object, ...], said: str
+) -> None:
+    assert_one_line(run("fuse", *maps, "--out", tmp_path / "out", *flags), said)
+    of_sensor = ("fuse", maps[0], "sensor", "--min-confidence", 0.5, "--out", tmp_path / "out")
+    assert_one_line(run(*of_sensor), "--min-confidence")
+    assert not (tmp_path / "out").exists()
+
+
 def test_glb_needs_its_extra(
     maps: tuple[Path, Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -143,5 +143,10 @@ def test_the_command_tries_all_view_sets_and_says_what_it_chose(
     summary = json.loads((out / "summary.2-of-2.json").read_text())
     settings = summary["settings"]
     assert settings["predict"]["work_pixels"] == LARGE_PIXELS
+    for number in (2, 1):  # what one has chosen is not tried again
+        assert run("depth", capture.path, "--out", out, "--shard", f"{number}/2").code == 0
+    assert json.loads((out / "summary.json").read_text())["settings"] == settings
     run("depth", capture.path, "--out", tmp_path / "b", "--work-size", 48, 64, "--no-page")
     assert len(tried) == 1
+    assert run("depth", capture.path, "--out", out, "--overwrite", "--no-page").code == 0
+    assert len(tried) == 2
