@@ -26,6 +26,7 @@ ROUGHNESS = 0.03
 """Standard deviation of what no neighbour shares: the map's own noise."""
 MOST = 512
 """Places that the process is conditioned on."""
+PIXELS = 1 << 12
 TOLERANCE, ROUNDS = 3.0, 6
 """Standard deviations by which a depth may differ from what the others predict, and how often that
 is asked."""
@@ -70,6 +71,13 @@ class Correction(NamedTuple):
     def __call__(self, places: Places) -> Tensor:
         """``(B, M')`` what is to be added to log depth at other places."""
         return (covariance(places, self.places) @ self.shares[..., None])[..., 0]
+
+    def everywhere(self, log_depth: Tensor) -> Tensor:
+        """``(B, 1, H, W)`` the same at all pixels of a map, not too many of them at a time."""
+        batch, count = log_depth.shape[0], log_depth.shape[-2:].numel()
+        pixels = torch.arange(count, device=log_depth.device).expand(batch, count)
+        parts = [self(Places.at(some, log_depth)) for some in torch.split(pixels, PIXELS, dim=-1)]
+        return torch.cat(parts, dim=-1).view(log_depth.shape)
 
     def variance(self, places: Places) -> Tensor:
         """``(B, M')`` how much stays open there."""

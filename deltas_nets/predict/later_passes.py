@@ -11,8 +11,10 @@ from deltas_geom import PosedViews
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.heard import Heard
+from deltas_nets.agree.held import held
 from deltas_nets.agree.neighbours import neighbours, sample
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.spread import spread
 from deltas_nets.captures.straight import straight
 from deltas_nets.errors import UserError
@@ -22,6 +24,7 @@ from deltas_nets.outputs.first_maps import FirstMaps
 from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, finished_map
 from deltas_nets.predict.described import AtSize
 from deltas_nets.predict.look import as_photographed
+from deltas_nets.predict.ours import known_depth
 from deltas_nets.predict.predictor import Predictor
 
 __all__ = ["LaterPasses"]
@@ -89,9 +92,19 @@ class LaterPasses:
 
     @torch.inference_mode()
     def finished(
-        self, id: str, found: KnownDepth, config: PredictConfig
+        self,
+        id: str,
+        found: KnownDepth,
+        config: PredictConfig,
+        measured: MeasuredDepth | None = None,
     ) -> tuple[DepthMap, dict[str, Any]]:
         """A map as it is written, and what the first pass recorded of it.
+
+        Args:
+            id: of the frame.
+            found: ``(1, h, w)``, which has heard others.
+            config: sizes, confidence.
+            measured: depth of the frame, to which the map is held.
 
         Raises:
             UserError: the image cannot be read.
@@ -101,7 +114,12 @@ class LaterPasses:
         of_straight = config if anchor is photo else replace(config, size=None)
         size = (found.depth.shape[-2], found.depth.shape[-1])
         nothing = KeypointDepths(torch.zeros(0, 2), torch.zeros(0), size)
-        result = finished_map(anchor, self.drawn(id, found), nothing, of_straight)
+        drawn = self.drawn(id, found)
+        if measured is not None:
+            drawn = held(
+                drawn, KnownDepth(*(part[0] for part in known_depth(anchor, measured, size)))
+            )
+        result = finished_map(anchor, drawn, nothing, of_straight)
         # A copy: the map stays in memory, and what is added to its record is not of the first pass.
         return as_photographed(result, anchor, config), dict(self._read(self.first, id).record)
 

@@ -93,7 +93,8 @@ class Passes:
 
         def make(views: ViewSet) -> Record:
             heard = later.hear(views.anchor, told)
-            found, record = later.finished(views.anchor, heard, self.config)
+            measured = self.search.measured(views)
+            found, record = later.finished(views.anchor, heard, self.config, measured)
             record["network_confidence"] = record["confidence"]
             return self._written(views, found, record | _confidence(found.confidence))
 

@@ -44,6 +44,10 @@ class Found(NamedTuple):
 class Search(Protocol):
     """How a frame's depth is searched."""
 
+    @property
+    def measured(self) -> Callable[[ViewSet], MeasuredDepth | None]:
+        """What is known of the anchor of a view set, in the capture's unit."""
+
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """The map of a view set; all but the range is the config's.
 
@@ -70,11 +74,11 @@ class Asked:
         near, far = depth_range
         unit = 1.0 if capture.metric else (ROOM[0] * ROOM[1] / (near * far)) ** 0.5
         self.capture, self.reach = capture, Reach(near, far, unit)
-        self._measured = _Known(capture, measured)
+        self.measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
-        frames, known = frames_of(self.capture, views), self._measured(views)
+        frames, known = frames_of(self.capture, views), self.measured(views)
         found = look(predictor, frames, config, self.reach, known)
         return Found(found, self.reach, end_of_pile(found_depths(found), self.reach))
 
@@ -91,13 +95,13 @@ class Followed:
 
     def __init__(self, capture: Capture, measured: Measured | None = None) -> None:
         self.capture = capture
-        self._measured = _Known(capture, measured)
+        self.measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
         frames = frames_of(self.capture, views)
         metric = self.capture.metric
-        position, known = self._measured.position[views.anchor], self._measured(views)
+        position, known = self.measured.position[views.anchor], self.measured(views)
         points, ranges = points_in_view(self.capture, position), self.capture.depth_ranges
         if ranges is not None:
             near, far = map(float, ranges[position])
@@ -165,11 +169,11 @@ class Completed:
 
     def __init__(self, capture: Capture, measured: Measured) -> None:
         self.capture = capture
-        self._measured = _Known(capture, measured)
+        self.measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
-        known = self._measured(views)
+        known = self.measured(views)
         if known is None or len(known.depth) == 0:
             what = f"nothing is measured of frame {views.anchor}"
             raise UserError(what, self.capture.path, "leave it out, or use --views 2 or more")
