@@ -163,6 +163,17 @@ def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
         ) from None
 
 
+def with_last(listed: str, new: str) -> str:
+    """A list in a record with an item at its end, and nowhere before.
+
+    Example:
+        >>> with_last("rooms; ScanNet", "rooms")
+        'ScanNet; rooms'
+    """
+    kept = [part for part in listed.split("; ") if part and part != new]
+    return "; ".join([*kept, new])
+
+
 def check_new_weights(file: Path, *, overwrite: bool) -> None:
     """Whether weights can be written to a file, before hours of work.
 

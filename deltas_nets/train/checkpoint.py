@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import torch
 
 from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
-from deltas_nets.distill.teachers import LICENCES
 from deltas_nets.errors import UserError
 from deltas_nets.network.networks import Network
 from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.train.average import RunningAverage
+from deltas_nets.train.provenance import Provenance, record_of
 from deltas_nets.weights_file import save_weights
 
 CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetensors"
@@ -30,51 +30,32 @@ class RunState(NamedTuple):
     step: int
 
 
-def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str) -> None:
+def save_run(folder: Path, config: TrainConfig, state: RunState, provenance: Provenance) -> None:
     """Write the config, the checkpoint to resume from and the averaged weights.
 
     Args:
         folder: of the run.
         config: of the run.
         state: after ``state.step`` steps.
-        origin: what the weights started from, with its licence.
+        provenance: where the weights come from.
     """
     write_json(folder / CONFIG, to_dict(config))
     average = state.average.model
     assert isinstance(average, Network)
-    public = without_paths(config)
-    data, licence = _data_and_licence(public)
-    metadata = {
+    metadata = record_of(config, provenance) | {
         "step": str(state.step),
         "seed": str(config.seed),
-        "data": data,
-        "origin": origin,
-        "licence": licence,
-        "train": json.dumps(to_dict(public)),
+        "train": json.dumps(to_dict(without_paths(config))),
     }
-    if config.teacher is not None:
-        metadata |= {
-            "detector_teacher": config.teacher,
-            "detector_teacher_licence": LICENCES[config.teacher],
-        }
     save_weights(folder / WEIGHTS, average, metadata)
     content = {
         "step": state.step,
-        "origin": origin,
+        **provenance._asdict(),
         "model": state.model.state_dict(),
         "average": average.state_dict(),
         "optimizer": state.optimizer.state_dict(),
     }
     write_atomically(folder / CHECKPOINT, lambda file: torch.save(content, file))
-
-
-def _data_and_licence(config: TrainConfig) -> tuple[str, str]:
-    """What weights were trained on, and what that leaves of our licence."""
-    data = config.data
-    if data.source == "rooms":
-        return f"procedural rooms {data.seed}..{data.seed + data.num_rooms}", "Apache-2.0"
-    terms = "trained on ScanNet, whose terms of use apply"
-    return f"ScanNet, scenes of {data.scannet.split}", terms
 
 
 def remove_half_written(folder: Path) -> None:
@@ -99,11 +80,11 @@ def load_config(folder: Path) -> TrainConfig:
         raise UserError(f"config is not readable ({error})", file, "start a new run") from None
 
 
-def load_run(folder: Path, state: RunState) -> tuple[RunState, str]:
+def load_run(folder: Path, state: RunState) -> tuple[RunState, Provenance]:
     """Put a run's checkpoint into model, average and optimizer.
 
     Returns:
-        The state with its step, and the origin of the weights.
+        The state with its step, and where the weights come from.
 
     Raises:
         UserError: there is no checkpoint, it cannot be read, or is of another network.
@@ -126,4 +107,6 @@ def load_run(folder: Path, state: RunState) -> tuple[RunState, str]:
             file,
             f"go on from its weights in a new folder: --init {folder / WEIGHTS}",
         ) from None
-    return state._replace(step=content["step"]), str(content["origin"])
+    # Checkpoints of before have the origin alone.
+    said = {name: content[name] for name in Provenance._fields if name in content}
+    return state._replace(step=content["step"]), Provenance(**said)

@@ -70,7 +70,7 @@ def fit(
     fabric = launch_fabric(config)
     tell = report if fabric.is_global_zero else _silently
     data, held_out = training_data(config, report=tell), validation_data(config, report=tell)
-    state, origin, teacher = starting_state(config, folder, start, fabric, tell)
+    state, provenance, teacher = starting_state(config, folder, start, fabric, tell)
     objective = Objective(state.model, config)
     wrapped, optimizer = fabric.setup(objective, state.optimizer)
     stepper = Stepper(objective, wrapped, optimizer, fabric, teacher)
@@ -84,7 +84,7 @@ def fit(
     def save() -> None:
         nonlocal saved
         if fabric.is_global_zero and saved != step:
-            save_run(folder, config, state._replace(step=step), origin=origin)
+            save_run(folder, config, state._replace(step=step), provenance)
         saved = step
 
     if fabric.is_global_zero:
