@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
@@ -24,12 +25,15 @@ __all__ = [
     "cannot_write",
     "check_writable",
     "plain",
+    "remove_abandoned",
     "write_atomically",
     "write_json",
 ]
 
 TEMPORARY = re.compile(r"\..*\.deltas-tmp$")
 """Names of files that a killed run left half written."""
+ABANDONED = 3600.0
+"""Seconds after which nobody writes such a file any more."""
 
 
 def write_json(path: Path, obj: object) -> None:
@@ -63,6 +67,20 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             raise cannot_write(path, error) from error
         raise
     _sync_folder(path.parent)
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what killed processes were writing into a folder that many processes share.
+
+    What is younger than an hour may still be written by one of them.
+    """
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        if TEMPORARY.match(path.name):
+            with contextlib.suppress(OSError):  # another process may have removed it, too
+                if time.time() - path.stat().st_mtime > ABANDONED:
+                    path.unlink()
 
 
 def _sync_folder(folder: Path) -> None:

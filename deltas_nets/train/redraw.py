@@ -30,7 +30,7 @@ from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.lite.redraw import Redraw
-from deltas_nets.outputs.atomic_files import check_writable
+from deltas_nets.outputs.atomic_files import check_writable, remove_abandoned
 from deltas_nets.rooms import Rooms
 from deltas_nets.rooms.rooms import VERSION
 from deltas_nets.train.average import RunningAverage
@@ -159,6 +159,7 @@ def heard_rooms(model: Deltas, config: RedrawConfig, folder: Path) -> HeardRooms
         image_size=(height, width),
         close_ups=config.close_ups,
     )
+    remove_abandoned(folder / name)
     on_host = copy.deepcopy(model).cpu()  # its processes cannot share another device
     return HeardRooms(
         DisturbedRooms(rooms),
