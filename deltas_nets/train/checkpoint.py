@@ -6,19 +6,21 @@ speaks of weights that are not there, and a run goes on from the last one that w
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
 from deltas_nets.errors import UserError
 from deltas_nets.network.networks import Network
+from deltas_nets.network.torch_file import read_torch_file
 from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.provenance import Provenance, record_of
 from deltas_nets.weights_file import save_weights
 
 CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetensors"
+_IN_A_CHECKPOINT = {"step", "origin", "model", "average", "optimizer"}
 
 
 class RunState(NamedTuple):
@@ -76,7 +78,7 @@ def load_config(folder: Path) -> TrainConfig:
         return from_dict(TrainConfig, json.loads(file.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise UserError("nothing to resume", folder, "name the --out of an earlier run") from None
-    except (ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"config is not readable ({error})", file, "start a new run") from None
 
 
@@ -90,22 +92,22 @@ def load_run(folder: Path, state: RunState) -> tuple[RunState, Provenance]:
         UserError: there is no checkpoint, it cannot be read, or is of another network.
     """
     file = folder / CHECKPOINT
-    try:
-        content: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise UserError("no checkpoint to resume", file, "start without --resume") from None
-    except (RuntimeError, EOFError, ValueError) as error:
-        raise UserError(f"checkpoint is damaged ({error})", file, "start a new run") from None
+    if not file.exists():
+        raise UserError("no checkpoint to resume", file, "start without --resume")
+    weights = f"go on from its weights in a new folder: --init {folder / WEIGHTS}"
+    content = read_torch_file(file, remedy=weights)
+    if not isinstance(content, dict) or not content.keys() >= _IN_A_CHECKPOINT:
+        raise UserError("this is no checkpoint of a training", file, weights)
     try:
         state.model.load_state_dict(content["model"])
         state.average.model.load_state_dict(content["average"])
         state.optimizer.load_state_dict(content["optimizer"])
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, TypeError, KeyError, AttributeError) as error:
         first = str(error).splitlines()[-1].strip()
         raise UserError(
             f"checkpoint of another version of the network ({first[:120]})",
             file,
-            f"go on from its weights in a new folder: --init {folder / WEIGHTS}",
+            weights,
         ) from None
     # Checkpoints of before have the origin alone.
     said = {name: content[name] for name in Provenance._fields if name in content}

@@ -266,10 +266,18 @@ def test_what_cannot_be_started_from_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "empty").exists()
 
 
-def test_a_damaged_checkpoint_is_an_error(copy: Path) -> None:
-    file = copy / "checkpoint.pt"
-    file.write_bytes(file.read_bytes()[:1000])
-    with pytest.raises(UserError, match=r"checkpoint is damaged .*checkpoint.pt"):
+@pytest.mark.parametrize("other", [{}, [1], {"model": 1}, 7])
+def test_another_file_of_torch_is_no_checkpoint(copy: Path, other: object) -> None:
+    torch.save(other, copy / "checkpoint.pt")
+    with pytest.raises(UserError, match=r"no checkpoint of a training.*checkpoint.pt: .*--init"):
+        fit(CONFIG, copy, Start(resume=True))
+
+
+@pytest.mark.parametrize("part", ["model", "average", "optimizer"])
+@pytest.mark.parametrize("wrong", [None, {}, torch.zeros(1)])
+def test_a_checkpoint_of_other_parts_is_refused(copy: Path, part: str, wrong: object) -> None:
+    torch.save(read_checkpoint(copy) | {part: wrong}, copy / "checkpoint.pt")
+    with pytest.raises(UserError, match=r"checkpoint of another version.*checkpoint.pt: "):
         fit(CONFIG, copy, Start(resume=True))
 
 
