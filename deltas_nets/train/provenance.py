@@ -10,6 +10,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.weights_file import with_last
 
 OURS = "Apache-2.0"
+TEACHER = "--teacher-weights"
 _OF_POINTS = ("detector_teacher", "detector_teacher_licence", "detector_data")
 """What weights still owe to whoever taught their detector, however much they learn afterwards."""
 
@@ -20,12 +21,12 @@ class Provenance(NamedTuple):
     Attributes:
         origin: what they started from, with its licence.
         before: the record of the weights that they started from; None if there were none.
-        files: SHA-256 of each file that the run began with, by its option.
+        began: what the run began with, by option: SHA-256 of files, and the step.
     """
 
     origin: str
     before: Mapping[str, str] | None = None
-    files: Mapping[str, str] | None = None
+    began: Mapping[str, str] | None = None
 
 
 def record_of(config: TrainConfig, provenance: Provenance) -> dict[str, str]:
@@ -47,8 +48,8 @@ def record_of(config: TrainConfig, provenance: Provenance) -> dict[str, str]:
     return record
 
 
-def check_files(began: Mapping[str, str] | None, given: Mapping[str, str], folder: Path) -> None:
-    """Whether a run goes on with the files that it began with, as far as any are given.
+def check_began(began: Mapping[str, str] | None, given: Mapping[str, str], folder: Path) -> None:
+    """Whether a run goes on with the files and the step that it began with, as far as given.
 
     Args:
         began: by option; None of a run of before they were kept.
@@ -56,14 +57,13 @@ def check_files(began: Mapping[str, str] | None, given: Mapping[str, str], folde
         folder: of the run.
 
     Raises:
-        UserError: names the option whose file is another.
+        UserError: names the option that says something else.
     """
-    for option, fingerprint in given.items():
-        if began is not None and began.get(option) != fingerprint:
-            remedy = "give the file of then, or start a new run in another folder"
-            if option != "--teacher-weights":
-                remedy = "leave that option out, or start a new run in another folder"
-            raise UserError(f"the run in {folder} began without this file", option, remedy)
+    for option, value in given.items():
+        if began is not None and began.get(option) != value:
+            wanted = "give the file of then" if option == TEACHER else "leave that option out"
+            what = f"the run in {folder} did not begin with this"
+            raise UserError(what, option, f"{wanted}, or start a new run in another folder")
 
 
 def _still_holds(name: str, config: TrainConfig) -> bool:

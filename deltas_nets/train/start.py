@@ -18,7 +18,7 @@ from deltas_nets.train.batch_norm import prepare_batch_norm
 from deltas_nets.train.checkpoint import RunState, load_run
 from deltas_nets.train.freeze import frozen_stages
 from deltas_nets.train.optimiser import make_optimizer
-from deltas_nets.train.provenance import Provenance, check_files
+from deltas_nets.train.provenance import TEACHER, Provenance, check_began
 from deltas_nets.train.resume import check_continues
 from deltas_nets.train.step import unreached
 from deltas_nets.weights_file import read_metadata, sha256_of, start_from_weights, weights_file
@@ -35,8 +35,8 @@ class Start:
         encoder: a public checkpoint for the encoder.
         init: a weights file for the whole network, which may have grown since.
         step: the first step, for a schedule that goes on from ``init``.
-        resume: go on from the checkpoint in the run's folder. Files that are given beside it are
-            only compared with those that the run began with.
+        resume: go on from the checkpoint in the run's folder. Files and a step that are given
+            beside it are only compared with those that the run began with.
         teacher: weights of the teacher that the config names. They are in no checkpoint: to go on
             it is given again.
     """
@@ -47,14 +47,11 @@ class Start:
     resume: bool = False
     teacher: Path | None = None
 
-    def fingerprints(self) -> dict[str, str]:
-        """SHA-256 of each file that is named, by its option."""
-        files = {
-            "--encoder": self.encoder,
-            "--init": self.init,
-            "--teacher-weights": self.teacher,
-        }
-        return {
+    def began(self) -> dict[str, str]:
+        """SHA-256 of each file that is named, by its option, and the step if it is not 0."""
+        files = {"--encoder": self.encoder, "--init": self.init, TEACHER: self.teacher}
+        step = {"--start-step": str(self.step)} if self.step else {}
+        return step | {
             # A teacher of ours may be a name.
             option: sha256_of(weights_file(file))
             for option, file in files.items()
@@ -125,10 +122,10 @@ def starting_state(
     average = RunningAverage(model, config.average)
     optimizer = make_optimizer(model, config)
     state = RunState(model, average, optimizer, start.step)
-    provenance = Provenance(origin, before, start.fingerprints())
+    provenance = Provenance(origin, before, start.began())
     if start.resume:
         state, provenance = load_run(folder, state)
-        check_files(provenance.files, start.fingerprints(), folder)
+        check_began(provenance.began, start.began(), folder)
     prepare_batch_norm(model, config, processes=fabric.world_size)
     if teacher is None:
         return Started(state, provenance, None)

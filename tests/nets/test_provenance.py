@@ -98,6 +98,7 @@ def test_a_run_goes_on_with_the_files_that_it_began_with(
         (Start(resume=True, teacher=other), "--teacher-weights"),
         (Start(resume=True, init=other, teacher=teacher), "--init"),
         (Start(resume=True, encoder=other, teacher=teacher), "--encoder"),
+        (Start(resume=True, step=2, teacher=teacher), "--start-step"),
     ):
-        with pytest.raises(UserError, match=f"began without this file, {option}: "):
+        with pytest.raises(UserError, match=f"did not begin with this, {option}: "):
             train(run, config, changed, stop=1)
