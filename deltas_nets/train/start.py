@@ -12,7 +12,7 @@ from deltas_nets.config import TrainConfig
 from deltas_nets.distill.supervision import TeacherLabels
 from deltas_nets.distill.teachers import load_teacher
 from deltas_nets.errors import UserError
-from deltas_nets.network.networks import build_network
+from deltas_nets.network.networks import Network, build_network
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.batch_norm import prepare_batch_norm
 from deltas_nets.train.checkpoint import RunState, load_run
@@ -113,10 +113,11 @@ def starting_state(
         model.calibration.reset()  # it was fitted to what is about to change
     for stage in frozen_stages(model, config):
         stage.requires_grad_(False)
-    if fabric.world_size > 1:
-        parameters = dict(model.named_parameters())
-        for name in unreached(model, config):
-            parameters[name].requires_grad_(False)
+    if config.freeze or fabric.world_size > 1:
+        idle = _idle(model, config)
+        # One process keeps them: its checkpoints have had them all along.
+        for parameter in idle if fabric.world_size > 1 else ():
+            parameter.requires_grad_(False)
     # On the device before anything copies the weights or keeps state beside them.
     fabric.to_device(model)
     average = RunningAverage(model, config.average)
@@ -130,6 +131,20 @@ def starting_state(
     if teacher is None:
         return Started(state, provenance, None)
     return Started(state, provenance, TeacherLabels(fabric.to_device(teacher)))
+
+
+def _idle(model: Network, config: TrainConfig) -> list[nn.Parameter]:
+    """What is not frozen and no loss reaches.
+
+    Raises:
+        UserError: there is nothing else.
+    """
+    parameters = dict(model.named_parameters())
+    idle = [parameters[name] for name in unreached(model, config)]
+    if len(idle) == sum(parameter.requires_grad for parameter in parameters.values()):
+        what = "no loss teaches what is not frozen"
+        raise UserError(what, f"--freeze {' '.join(config.freeze)}", "leave another stage out")
+    return idle
 
 
 def _teacher(config: TrainConfig, start: Start) -> nn.Module | None:
