@@ -109,15 +109,17 @@ def fit(
             if failures == PATIENCE:
                 what = f"training diverged: no usable gradient in the {PATIENCE} steps up to {step}"
                 raise UserError(what, folder, "lower --learning-rate")
-            if result.stop and step < last:
-                save()
-                fabric.barrier()  # torchrun ends the others when one is gone
-                raise KeyboardInterrupt
+            stopped = result.stop and step < last
+            if stopped:
+                save()  # whoever stops a run may not wait for its validation
             if (step % validate_every == 0 or step == last) and fabric.is_global_zero:
                 log.validation(step, metrics_of(state.average.model, held_out))
             # After the validation: a run whose last checkpoint is written lacks nothing.
             if step % checkpoint_every == 0 or step == last:
                 save()
+            if stopped:
+                fabric.barrier()  # torchrun ends the others when one is gone
+                raise KeyboardInterrupt
     fabric.barrier()
     return folder / WEIGHTS
 

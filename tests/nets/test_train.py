@@ -138,6 +138,26 @@ def test_a_run_told_to_stop_finishes_its_step_and_goes_on_later(
     assert_same_state(tmp_path, unbroken)
 
 
+def test_a_run_told_to_stop_where_it_validates_is_saved_and_does_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take, saved = Stepper.__call__, []
+
+    def told(stepper: Stepper, batch: Batch, *, stop: bool) -> StepResult:
+        return take(stepper, batch, stop=stop)._replace(stop=True)
+
+    def validate(model: object) -> dict[str, float]:
+        saved.append(read_checkpoint(tmp_path)["step"])
+        return {}
+
+    monkeypatch.setattr(Stepper, "__call__", told)
+    monkeypatch.setattr(fit_module, "validate", validate)
+    with pytest.raises(KeyboardInterrupt):
+        fit(CONFIG, tmp_path, Start(), validate_every=1)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "validation" in line] == saved == [1]
+
+
 def test_a_finished_run_has_nothing_left_to_do(copy: Path) -> None:
     weights, log = copy / "weights.safetensors", copy / "log.jsonl"
     before = weights.read_bytes(), log.read_text()
