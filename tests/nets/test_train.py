@@ -359,6 +359,21 @@ def test_mirrored_resized_and_reordered_rooms_stay_consistent() -> None:
     changed.views.check_values()
 
 
+def test_a_mirrored_camera_sees_mirrored_points_at_mirrored_pixels(rooms: PosedImages) -> None:
+    K = rooms.views.K.clone()
+    K[..., 0, 1] = torch.tensor([7.0, -3.0, 20.0])  # skew, px
+    skewed = rooms._replace(images=rooms.images / 255, views=rooms.views._replace(K=K))
+    mirrored = mirror(skewed, torch.tensor([True, True]))
+    # In front of all views of the first room, which stand a metre or less from view 0.
+    points = torch.tensor([[-0.5, 0.4, 3.0], [0.6, -0.5, 4.0], [0.1, 0.3, 5.0]])
+    world = skewed.views.cam_from_world[0, 0].inverse()
+    points = points @ world[:3, :3].T + world[:3, 3]
+    seen = project(first_of(skewed).views, points).pixels
+    reflected = project(first_of(mirrored).views, points * torch.tensor([-1.0, 1, 1])).pixels
+    expected = torch.stack([skewed.images.shape[-1] - 1 - seen[..., 0], seen[..., 1]], dim=-1)
+    torch.testing.assert_close(reflected, expected, rtol=0, atol=1e-2)  # px
+
+
 def test_mirroring_twice_changes_nothing(rooms: PosedImages) -> None:
     floats = rooms._replace(images=rooms.images.float() / 255)
     both = torch.tensor([True, True])
