@@ -16,7 +16,7 @@ from deltas_nets.config.baselines import BASELINES
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.networks import Network, build_network
-from deltas_nets.outputs.atomic_files import check_writable, write_atomically
+from deltas_nets.outputs.atomic_files import check_file, write_atomically
 
 DEFAULT = "deltas-small"
 FORMAT = "1"
@@ -182,11 +182,9 @@ def check_new_weights(file: Path, *, overwrite: bool) -> None:
     """
     if file.suffix != ".safetensors":
         raise UserError("weights are .safetensors", file, "name such a file with --out")
-    if file.is_dir():
-        raise UserError("this is a folder, not a file", file, "name a file with --out")
+    check_file(file, remedy="name a file with --out")
     if file.exists() and not overwrite:
         raise UserError("the file exists", file, "add --overwrite or name a new file")
-    check_writable(file.parent)
 
 
 def save_weights(file: Path, model: Network, metadata: Mapping[str, str]) -> None:

@@ -23,6 +23,7 @@ from deltas_nets.errors import UserError
 __all__ = [
     "TEMPORARY",
     "cannot_write",
+    "check_file",
     "check_writable",
     "plain",
     "remove_abandoned",
@@ -110,6 +111,17 @@ def check_writable(out: Path) -> None:
             file.write(b"x")
     except OSError as error:
         raise cannot_write(out, error) from error
+
+
+def check_file(file: Path, *, remedy: str = "name a file") -> None:
+    """Whether a file can be written, before the work whose results it is for.
+
+    Raises:
+        UserError: it is a folder, or the system refuses.
+    """
+    if file.is_dir():
+        raise UserError("this is a folder, not a file", file, remedy)
+    check_writable(file.parent)
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:
