@@ -16,7 +16,7 @@ from deltas_nets.config.baselines import BASELINES
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.networks import Network, build_network
-from deltas_nets.outputs.atomic_files import check_writable, write_atomically
+from deltas_nets.outputs.atomic_files import check_file, write_atomically
 
 DEFAULT = "deltas-small"
 FORMAT = "1"
@@ -163,6 +163,17 @@ def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
         ) from None
 
 
+def with_last(listed: str, new: str) -> str:
+    """A list in a record with an item at its end, and nowhere before.
+
+    Example:
+        >>> with_last("rooms; ScanNet", "rooms")
+        'ScanNet; rooms'
+    """
+    kept = [part for part in listed.split("; ") if part and part != new]
+    return "; ".join([*kept, new])
+
+
 def check_new_weights(file: Path, *, overwrite: bool) -> None:
     """Whether weights can be written to a file, before hours of work.
 
@@ -171,11 +182,9 @@ def check_new_weights(file: Path, *, overwrite: bool) -> None:
     """
     if file.suffix != ".safetensors":
         raise UserError("weights are .safetensors", file, "name such a file with --out")
-    if file.is_dir():
-        raise UserError("this is a folder, not a file", file, "name a file with --out")
+    check_file(file, remedy="name a file with --out")
     if file.exists() and not overwrite:
         raise UserError("the file exists", file, "add --overwrite or name a new file")
-    check_writable(file.parent)
 
 
 def save_weights(file: Path, model: Network, metadata: Mapping[str, str]) -> None:

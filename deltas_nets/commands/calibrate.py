@@ -58,12 +58,17 @@ class Calibrate(Command):
             measure_rooms,
         )
         from deltas_nets.network.lite.calibration import VIEWS
-        from deltas_nets.outputs.atomic_files import check_writable
         from deltas_nets.terminal import progress
-        from deltas_nets.weights_file import load_model, read_metadata, save_weights, weights_file
+        from deltas_nets.weights_file import (
+            check_new_weights,
+            load_model,
+            read_metadata,
+            save_weights,
+            weights_file,
+        )
 
+        check_new_weights(self.out, overwrite=self.overwrite)
         self._check()
-        check_writable(self.out.parent)
         model = load_model(self.weights, usable_device(self.device))
         metadata = read_metadata(weights_file(self.weights))
         held_out = held_out_rooms(
@@ -95,10 +100,6 @@ class Calibrate(Command):
         print(f"weights in {self.out}")
 
     def _check(self) -> None:
-        if self.out.suffix != ".safetensors":
-            raise UserError("weights are .safetensors", self.out, "name such a file with --out")
-        if self.out.exists() and not self.overwrite:
-            raise UserError("the file exists", self.out, "add --overwrite or name a new file")
         if not 2 <= self.rooms <= 500:
             raise UserError(f"no {self.rooms} rooms", "--rooms", "give 2 to 500")
         if not 2 <= self.views <= 12:

@@ -62,12 +62,12 @@ class Check(Command):
         from deltas_nets.check.words import mended_in_words, report_lines
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.errors import UserError
-        from deltas_nets.outputs.atomic_files import check_writable, write_json
+        from deltas_nets.outputs.atomic_files import check_file, write_json
         from deltas_nets.terminal import progress, warn
         from deltas_nets.weights_file import load_model
 
         if self.json is not None:
-            check_writable(self.json.parent)
+            check_file(self.json)
         device = usable_device(self.device)
         # Frames are small: threads that share one wait for each other, those with their own do not.
         threads = min(MOST_THREADS, torch.get_num_threads())

@@ -51,7 +51,10 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
     said = io.StringIO()
     names = {command.__name__.lower(): command for command in commands}
     groups = names[arguments[0]].groups if arguments[0] in names else {}
-    kinds: Any = Union[tuple(command.parsed_as(arguments) for command in commands)]  # noqa: UP007
+    try:
+        kinds: Any = Union[tuple(command.parsed_as(arguments) for command in commands)]  # noqa: UP007
+    except UserError as error:
+        _fail(error)
     try:
         with contextlib.redirect_stderr(said), _shown_by(groups):
             command: Command = tyro.cli(

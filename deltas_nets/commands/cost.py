@@ -43,11 +43,11 @@ class Cost(Command):
         from deltas_nets.commands.flags import usable_device
         from deltas_nets.cost.command import run_cost
         from deltas_nets.network.networks import build_network
-        from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.outputs.atomic_files import check_file
         from deltas_nets.reference import ReferenceNetwork
 
         if self.json is not None:
-            check_writable(self.json.parent)
+            check_file(self.json)
         device = usable_device(self.device)
         networks = {
             name: ReferenceNetwork() if name == "reference" else build_network(CONFIGS[name])

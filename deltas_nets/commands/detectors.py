@@ -65,10 +65,10 @@ class Detectors(Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.outputs.atomic_files import check_file
 
         if self.json is not None:
-            check_writable(self.json.parent)
+            check_file(self.json)
         if self.capture.is_file():
             self._of_pairs()
         else:

@@ -88,12 +88,12 @@ class Evaluate(Prediction):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.outputs.atomic_files import check_file
 
         self._check_what()
         for file in (self.json, self.csv):
             if file is not None:
-                check_writable(file.parent)
+                check_file(file)
         scores, title = self._of_rooms() if self.rooms is not None else self._of_scenes()
         self._write(scores)  # before the reader of what is printed may have had enough
         self._print(scores, title)

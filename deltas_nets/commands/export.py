@@ -46,7 +46,7 @@ class Export(Command):
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.export import ExportConfig, export_onnx, export_program
-        from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.outputs.atomic_files import check_file
         from deltas_nets.predict.predictor import load_predictor
         from deltas_nets.weights_file import weights_record
 
@@ -63,7 +63,7 @@ class Export(Command):
             depth_range=self.depth_range,
             refinement=self.refinement,
         )
-        check_writable(self.out.parent)
+        check_file(self.out)
         what = "the reference network is not exported"
         remedy = "name weights of deltas train"
         model = load_predictor(self.weights).deltas(what, self.weights, remedy)

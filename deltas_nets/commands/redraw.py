@@ -21,7 +21,7 @@ class Redraw(RedrawConfig, Command):
     device: str = "auto"
     """Where to compute: auto, cpu, cuda, cuda:1, mps."""
     overwrite: Flag = False
-    """Replace --out if it exists."""
+    """Replace --out and --log if they exist."""
     debug: Flag = False
     """Show the traceback of an error."""
 

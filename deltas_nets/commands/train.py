@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -66,16 +66,28 @@ class Train(Command):
 
     @classmethod
     def parsed_as(cls, arguments: Sequence[str]) -> Any:
-        """The flags' defaults are those of the network that --config names."""
+        """The flags' defaults: of the network that --config names, or the run that goes on.
+
+        So whatever differs from the run was asked for.
+
+        Raises:
+            UserError: there is no run to go on with.
+        """
         preset = preset_of(arguments)
         default = cls(out=Path("runs") / preset, preset=preset, config=TRAIN_CONFIGS[preset])
+        helps = {"--help", "-h"} & set(arguments)
+        if [*arguments[:1]] == ["train"] and "--resume" in arguments and not helps:
+            from deltas_nets.train.checkpoint import load_config
+
+            config = load_config(Path(value_of("--out", arguments) or default.out))
+            default = replace(default, config=config, preset=preset_like(config))
         return Annotated[cls, tyro.conf.subcommand(name="train", default=default)]
 
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.outputs.atomic_files import check_writable
         from deltas_nets.train.fit import fit
-        from deltas_nets.train.resume import resumed_config
+        from deltas_nets.train.resume import check_continues
         from deltas_nets.train.start import Start
         from deltas_nets.weights_file import weights_file
 
@@ -84,8 +96,8 @@ class Train(Command):
             raise UserError("start from what?", "--start-step", "add --init FILE")
         config = self.config
         if self.resume:
-            config = resumed_config(self.out, self.config, TRAIN_CONFIGS[self.preset])
-            if self.preset not in ("deltas-small", config.network.name):
+            check_continues(self.out, config)
+            if self.preset != preset_like(config):
                 what = f"the run to go on with is of {config.network.name}"
                 raise UserError(what, f"--config {self.preset}", "leave it out")
         if self.start_step >= config.steps:
@@ -97,8 +109,9 @@ class Train(Command):
                 "the folder holds another run", self.out, "add --resume or name a new folder"
             )
         check_writable(self.out)
-        fresh = not self.resume and self.init is None
-        encoder = encoder_file(self.encoder, config.network.backbone) if fresh else None
+        encoder = None
+        if self.init is None and not (self.resume and self.encoder == "pretrained"):
+            encoder = encoder_file(self.encoder, config.network.backbone)
         init = None if self.init is None else weights_file(self.init)
         start = Start(encoder, init, self.start_step, self.resume, self.teacher_weights)
         weights = fit(
@@ -121,12 +134,23 @@ class Train(Command):
 
 def preset_of(arguments: Sequence[str]) -> Preset:
     """What --config names: the defaults of the other flags depend on it."""
+    name = value_of("--config", arguments)
+    return next((network for network in PRESETS if network == name), "deltas-small")
+
+
+def preset_like(config: TrainConfig) -> Preset:
+    """The preset that a run's network is called after; networks of other names have the usual."""
+    return next((preset for preset in PRESETS if preset == config.network.name), "deltas-small")
+
+
+def value_of(option: str, arguments: Sequence[str]) -> str | None:
+    """What follows an option, the last time if it is there twice."""
+    value = None
     for word, following in pairwise([*arguments, ""]):
-        name = word.partition("=")[2] if word.startswith("--config=") else following
-        for network in PRESETS:
-            if word.partition("=")[0] == "--config" and name == network:
-                return network
-    return "deltas-small"
+        name, equals, inside = word.partition("=")
+        if name == option:
+            value = inside if equals else following
+    return value
 
 
 def encoder_file(name: str, backbone: str) -> Path | None:

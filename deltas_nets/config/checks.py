@@ -3,9 +3,18 @@
 import math
 from typing import Any
 
-__all__ = ["check_at_least", "check_finite", "check_positive", "check_seed", "check_share"]
+__all__ = [
+    "check_at_least",
+    "check_finite",
+    "check_positive",
+    "check_seed",
+    "check_share",
+    "check_unseen",
+]
 
 MAX_SEED = 2**32 - 1
+HELD_OUT = 1000
+"""Seeds below are those of rooms that are measured on."""
 
 
 def check_at_least(least: int, config: Any, *names: str) -> None:
@@ -46,6 +55,13 @@ def check_seed(config: Any) -> None:
     """Generators take the config's ``seed``; raises as :func:`check_at_least`."""
     if not 0 <= config.seed <= MAX_SEED:
         raise ValueError(f"seed must be within [0, {MAX_SEED}], got {config.seed}")
+
+
+def check_unseen(config: Any, name: str) -> None:
+    """No room from this field's seed on is measured on; raises as :func:`check_at_least`."""
+    if getattr(config, name) < HELD_OUT:
+        what = f"{name} must be {HELD_OUT} or more, as no training sees the rooms below"
+        raise ValueError(f"{what}; got {getattr(config, name)}")
 
 
 def _numbers(config: Any, name: str) -> tuple[float, ...]:

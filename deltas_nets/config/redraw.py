@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from deltas_nets.config.checks import check_at_least, check_positive, check_seed
+from deltas_nets.config.checks import check_at_least, check_positive, check_seed, check_unseen
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,8 @@ class RedrawConfig:
             raise ValueError(f"close_ups must be within [0, 1], got {self.close_ups}")
         if not self.sizes or min(map(min, self.sizes)) < 32:
             raise ValueError(f"sizes must be HEIGHT WIDTH of 32 or more, got {self.sizes}")
-        if self.first_room < VALIDATED:
-            what = f"first_room must be {VALIDATED} or more, as no training sees those below"
-            raise ValueError(f"{what}; got {self.first_room}")
+        check_unseen(self, "first_room")
 
 
 MOST_VIEWS = 12
 """Of a room."""
-VALIDATED = 1000
-"""Seeds below are those of rooms that are measured on."""

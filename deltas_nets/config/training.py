@@ -1,11 +1,17 @@
 """What a training run depends on: data and schedule, and the weights of its losses."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 
-from deltas_nets.config.checks import check_at_least, check_positive, check_seed, check_share
+from deltas_nets.config.checks import (
+    check_at_least,
+    check_positive,
+    check_seed,
+    check_share,
+    check_unseen,
+)
 from deltas_nets.config.losses import LossConfig
 from deltas_nets.config.network import NetworkConfig
 from deltas_nets.config.scannet import ScanNetConfig
@@ -24,7 +30,7 @@ class DataConfig:
     num_rooms: int = 4000
     """rooms: how many in an epoch."""
     seed: int = 1000
-    """rooms: seed of the first one; validation rooms have seeds below 1000."""
+    """rooms: seed of the first one, 1000 or more: rooms that are measured on have those below."""
     close_ups: float = 0.0
     """rooms: share of them that are desks, shelves and floors from near by, enlarged as the network
     sees what is nearer than rooms are."""
@@ -52,6 +58,8 @@ class DataConfig:
         if self.source == "rooms" and self.scannet != ScanNetConfig():
             raise ValueError("--root and the other options of ScanNet need --data scannet")
         check_seed(self)
+        if self.source == "rooms":
+            check_unseen(self, "seed")
         check_at_least(0, self, "workers")
         check_at_least(1, self, "num_rooms")
         check_at_least(2, self, "num_views")
@@ -139,6 +147,8 @@ class TrainConfig:
         check_at_least(8, self, "num_keypoints")
         check_positive(self, "learning_rate", "encoder_rate", "clip_gradient")
         check_share(self, "average")
+        if set(self.freeze) >= set(get_args(Stage)):
+            raise ValueError("freeze must leave a stage that learns, got all of them")
         if self.batch_size % self.accumulate:
             raise ValueError(
                 f"batch_size must be a multiple of accumulate, got {self.batch_size} and "

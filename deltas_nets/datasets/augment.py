@@ -54,6 +54,7 @@ def mirror(batch: PosedImages, flips: Tensor) -> PosedImages:
     """
     width = batch.images.shape[-1]
     K = batch.views.K.clone()
+    K[..., 0, 1] = -K[..., 0, 1]  # skew leans to the other side
     K[..., 0, 2] = width - 1 - K[..., 0, 2]
     reflect = torch.eye(4, device=K.device, dtype=K.dtype)
     reflect[0, 0] = -1

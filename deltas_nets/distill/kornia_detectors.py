@@ -15,8 +15,9 @@ from typing import Any
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from deltas_nets.distill.weights_file import fill, read_state
+from deltas_nets.distill.weights_file import fill
 from deltas_nets.errors import UserError
+from deltas_nets.network.torch_file import read_state
 
 ALIKED_BY_STEM = {8: "aliked-t16", 16: "aliked-n16"}
 """kornia's names of the sizes of ALIKED, by the channels of the first layer."""

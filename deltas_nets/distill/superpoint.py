@@ -12,8 +12,9 @@ from typing import NamedTuple
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from deltas_nets.distill.weights_file import fill, read_state
+from deltas_nets.distill.weights_file import fill
 from deltas_nets.errors import UserError
+from deltas_nets.network.torch_file import read_state
 
 CELL = 8
 """Side of a detector cell, pixels."""

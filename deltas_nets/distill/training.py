@@ -35,6 +35,7 @@ from deltas_nets.weights_file import (
     read_metadata,
     save_weights,
     weights_file,
+    with_last,
 )
 
 __all__ = ["DistillConfig", "distill", "record_of", "train_detector", "with_fine_branch"]
@@ -208,22 +209,16 @@ def record_of(config: DistillConfig, before: dict[str, str], loss: Tensor) -> di
     # Of a teacher that taught before, something is left.
     licences, licence = before.get("detector_teacher_licence", ""), LICENCES[config.teacher]
     return kept | {
-        "origin": _with_last(origin, f"detector distilled from {config.teacher}"),
+        "origin": with_last(origin, f"detector distilled from {config.teacher}"),
         "detector_teacher": config.teacher,
         "detector_teacher_file": config.teacher_weights.name,
-        "detector_teacher_licence": _with_last(licences, licence),
+        "detector_teacher_licence": with_last(licences, licence),
         "detector_data": f"{config.num_images} pictures: {_pictures(config)}",
         "detector_config": json.dumps(_public(config)),
         "detector_steps": str(config.steps),
         "detector_seed": str(config.seed),
         "detector_loss": f"{float(loss):.4f}",
     }
-
-
-def _with_last(listed: str, new: str) -> str:
-    """A list with an item at its end, and nowhere before."""
-    kept = [part for part in listed.split("; ") if part and part != new]
-    return "; ".join([*kept, new])
 
 
 def _pictures(config: DistillConfig) -> str:

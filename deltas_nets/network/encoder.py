@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from torch import nn
 
 from deltas_nets.errors import UserError
+from deltas_nets.network.torch_file import read_state
 
 
 class Origin(NamedTuple):
@@ -50,10 +50,7 @@ class ImageEncoder(nn.Module):
         Raises:
             UserError: the file is missing or holds something else.
         """
-        try:
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        except FileNotFoundError:
-            raise UserError("no encoder weights", file, f"name {self.origin.file}") from None
+        state = read_state(file, remedy=f"name {self.origin.file}")
         own, names = self.state_dict(), self.public_names()
         missing = sorted(
             public

@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
@@ -22,14 +23,18 @@ from deltas_nets.errors import UserError
 __all__ = [
     "TEMPORARY",
     "cannot_write",
+    "check_file",
     "check_writable",
     "plain",
+    "remove_abandoned",
     "write_atomically",
     "write_json",
 ]
 
 TEMPORARY = re.compile(r"\..*\.deltas-tmp$")
 """Names of files that a killed run left half written."""
+ABANDONED = 3600.0
+"""Seconds after which nobody writes such a file any more."""
 
 
 def write_json(path: Path, obj: object) -> None:
@@ -65,6 +70,20 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     _sync_folder(path.parent)
 
 
+def remove_abandoned(folder: Path) -> None:
+    """Remove what killed processes were writing into a folder that many processes share.
+
+    What is younger than an hour may still be written by one of them.
+    """
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        if TEMPORARY.match(path.name):
+            with contextlib.suppress(OSError):  # another process may have removed it, too
+                if time.time() - path.stat().st_mtime > ABANDONED:
+                    path.unlink()
+
+
 def _sync_folder(folder: Path) -> None:
     """Put the names in a folder on the disk, where the system can: some know no such thing."""
     with contextlib.suppress(OSError):
@@ -92,6 +111,17 @@ def check_writable(out: Path) -> None:
             file.write(b"x")
     except OSError as error:
         raise cannot_write(out, error) from error
+
+
+def check_file(file: Path, *, remedy: str = "name a file") -> None:
+    """Whether a file can be written, before the work whose results it is for.
+
+    Raises:
+        UserError: it is a folder, or the system refuses.
+    """
+    if file.is_dir():
+        raise UserError("this is a folder, not a file", file, remedy)
+    check_writable(file.parent)
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

@@ -1,19 +1,19 @@
 """Rooms to train on: rendered when asked for, kept on disk if a folder is given."""
 
-import os
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from deltas_geom.cameras.views import PosedViews
 from deltas_nets.captures.posed_images import PosedImages
+from deltas_nets.outputs.atomic_files import write_atomically
 from deltas_nets.rooms.close_up import draw_close_up
 from deltas_nets.rooms.enlarged import as_large_as_rooms
 from deltas_nets.rooms.render import render_view
@@ -144,11 +144,12 @@ class Rooms(Dataset[PosedImages]):
         path = self.cache_dir / (
             f"{name}-v{VERSION}-{self.num_views}x{height}x{width}-{seed}.safetensors"
         )
-        if path.exists():
+        try:
             return _read(path)
-        item = new()
-        _write(item, path)
-        return item
+        except (OSError, SafetensorError, KeyError):  # not there, or damaged
+            item = new()
+            _write(item, path)
+            return item
 
 
 def _expose(radiance: Tensor, *, brightness: float) -> Tensor:
@@ -165,15 +166,12 @@ def _read(path: Path) -> PosedImages:
 
 
 def _write(item: PosedImages, path: Path) -> None:
-    """Write under a temporary name first: whoever reads ``path`` finds all of it or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Whoever reads ``path`` finds all of it or nothing."""
     tensors = {
         "images": item.images,
         "K": item.views.K,
         "cam_from_world": item.views.cam_from_world,
         "depth": item.depth,
     }
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".writing-") as folder:
-        temporary = Path(folder) / path.name
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, temporary)
-        os.replace(temporary, path)
+    content = save({name: tensor.contiguous() for name, tensor in tensors.items()})
+    write_atomically(path, lambda opened: opened.write(content))

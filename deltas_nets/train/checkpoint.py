@@ -6,19 +6,21 @@ speaks of weights that are not there, and a run goes on from the last one that w
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
-from deltas_nets.distill.teachers import LICENCES
 from deltas_nets.errors import UserError
 from deltas_nets.network.networks import Network
+from deltas_nets.network.torch_file import read_torch_file
 from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically, write_json
 from deltas_nets.train.average import RunningAverage
+from deltas_nets.train.provenance import Provenance, record_of
 from deltas_nets.weights_file import save_weights
 
 CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.pt", "weights.safetensors"
+_IN_A_CHECKPOINT = {"step", "origin", "model", "average", "optimizer"}
 
 
 class RunState(NamedTuple):
@@ -30,51 +32,32 @@ class RunState(NamedTuple):
     step: int
 
 
-def save_run(folder: Path, config: TrainConfig, state: RunState, *, origin: str) -> None:
+def save_run(folder: Path, config: TrainConfig, state: RunState, provenance: Provenance) -> None:
     """Write the config, the checkpoint to resume from and the averaged weights.
 
     Args:
         folder: of the run.
         config: of the run.
         state: after ``state.step`` steps.
-        origin: what the weights started from, with its licence.
+        provenance: where the weights come from.
     """
     write_json(folder / CONFIG, to_dict(config))
     average = state.average.model
     assert isinstance(average, Network)
-    public = without_paths(config)
-    data, licence = _data_and_licence(public)
-    metadata = {
+    metadata = record_of(config, provenance) | {
         "step": str(state.step),
         "seed": str(config.seed),
-        "data": data,
-        "origin": origin,
-        "licence": licence,
-        "train": json.dumps(to_dict(public)),
+        "train": json.dumps(to_dict(without_paths(config))),
     }
-    if config.teacher is not None:
-        metadata |= {
-            "detector_teacher": config.teacher,
-            "detector_teacher_licence": LICENCES[config.teacher],
-        }
     save_weights(folder / WEIGHTS, average, metadata)
     content = {
         "step": state.step,
-        "origin": origin,
+        **provenance._asdict(),
         "model": state.model.state_dict(),
         "average": average.state_dict(),
         "optimizer": state.optimizer.state_dict(),
     }
     write_atomically(folder / CHECKPOINT, lambda file: torch.save(content, file))
-
-
-def _data_and_licence(config: TrainConfig) -> tuple[str, str]:
-    """What weights were trained on, and what that leaves of our licence."""
-    data = config.data
-    if data.source == "rooms":
-        return f"procedural rooms {data.seed}..{data.seed + data.num_rooms}", "Apache-2.0"
-    terms = "trained on ScanNet, whose terms of use apply"
-    return f"ScanNet, scenes of {data.scannet.split}", terms
 
 
 def remove_half_written(folder: Path) -> None:
@@ -95,35 +78,37 @@ def load_config(folder: Path) -> TrainConfig:
         return from_dict(TrainConfig, json.loads(file.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise UserError("nothing to resume", folder, "name the --out of an earlier run") from None
-    except (ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"config is not readable ({error})", file, "start a new run") from None
 
 
-def load_run(folder: Path, state: RunState) -> tuple[RunState, str]:
+def load_run(folder: Path, state: RunState) -> tuple[RunState, Provenance]:
     """Put a run's checkpoint into model, average and optimizer.
 
     Returns:
-        The state with its step, and the origin of the weights.
+        The state with its step, and where the weights come from.
 
     Raises:
         UserError: there is no checkpoint, it cannot be read, or is of another network.
     """
     file = folder / CHECKPOINT
-    try:
-        content: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise UserError("no checkpoint to resume", file, "start without --resume") from None
-    except (RuntimeError, EOFError, ValueError) as error:
-        raise UserError(f"checkpoint is damaged ({error})", file, "start a new run") from None
+    if not file.exists():
+        raise UserError("no checkpoint to resume", file, "start without --resume")
+    weights = f"go on from its weights in a new folder: --init {folder / WEIGHTS}"
+    content = read_torch_file(file, remedy=weights)
+    if not isinstance(content, dict) or not content.keys() >= _IN_A_CHECKPOINT:
+        raise UserError("this is no checkpoint of a training", file, weights)
     try:
         state.model.load_state_dict(content["model"])
         state.average.model.load_state_dict(content["average"])
         state.optimizer.load_state_dict(content["optimizer"])
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, TypeError, KeyError, AttributeError) as error:
         first = str(error).splitlines()[-1].strip()
         raise UserError(
             f"checkpoint of another version of the network ({first[:120]})",
             file,
-            f"go on from its weights in a new folder: --init {folder / WEIGHTS}",
+            weights,
         ) from None
-    return state._replace(step=content["step"]), str(content["origin"])
+    # Checkpoints of before have the origin alone.
+    said = {name: content[name] for name in Provenance._fields if name in content}
+    return state._replace(step=content["step"]), Provenance(**said)

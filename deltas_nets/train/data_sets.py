@@ -8,6 +8,7 @@ from torch.utils.data import Subset
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
 from deltas_nets.datasets.scannet import ScanNetViewSets, open_scannet
+from deltas_nets.outputs.atomic_files import remove_abandoned
 from deltas_nets.rooms import Rooms
 
 
@@ -24,6 +25,8 @@ def training_data(
         UserError: there is none of it.
     """
     data = config.data
+    if data.cache is not None:
+        remove_abandoned(Path(data.cache))
     if data.source == "scannet":
         return _frames(config, data.scannet.split, "--data.split", report)
     return Rooms(

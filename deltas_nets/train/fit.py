@@ -70,7 +70,7 @@ def fit(
     fabric = launch_fabric(config)
     tell = report if fabric.is_global_zero else _silently
     data, held_out = training_data(config, report=tell), validation_data(config, report=tell)
-    state, origin, teacher = starting_state(config, folder, start, fabric, tell)
+    state, provenance, teacher = starting_state(config, folder, start, fabric, tell)
     objective = Objective(state.model, config)
     wrapped, optimizer = fabric.setup(objective, state.optimizer)
     stepper = Stepper(objective, wrapped, optimizer, fabric, teacher)
@@ -84,7 +84,7 @@ def fit(
     def save() -> None:
         nonlocal saved
         if fabric.is_global_zero and saved != step:
-            save_run(folder, config, state._replace(step=step), origin=origin)
+            save_run(folder, config, state._replace(step=step), provenance)
         saved = step
 
     if fabric.is_global_zero:
@@ -109,15 +109,17 @@ def fit(
             if failures == PATIENCE:
                 what = f"training diverged: no usable gradient in the {PATIENCE} steps up to {step}"
                 raise UserError(what, folder, "lower --learning-rate")
-            if result.stop and step < last:
-                save()
-                fabric.barrier()  # torchrun ends the others when one is gone
-                raise KeyboardInterrupt
+            stopped = result.stop and step < last
+            if stopped:
+                save()  # whoever stops a run may not wait for its validation
             if (step % validate_every == 0 or step == last) and fabric.is_global_zero:
                 log.validation(step, metrics_of(state.average.model, held_out))
             # After the validation: a run whose last checkpoint is written lacks nothing.
             if step % checkpoint_every == 0 or step == last:
                 save()
+            if stopped:
+                fabric.barrier()  # torchrun ends the others when one is gone
+                raise KeyboardInterrupt
     fabric.barrier()
     return folder / WEIGHTS
 

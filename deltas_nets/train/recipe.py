@@ -139,8 +139,6 @@ def add_redraw(
     Returns:
         The weights with the stage.
     """
-    log = folder / "redraw.jsonl"
-    log.unlink(missing_ok=True)
     config = RedrawConfig(
         folder / "redrawn.safetensors",
         init=str(weights),
@@ -149,7 +147,7 @@ def add_redraw(
         sizes=recipe.redraw_sizes,
         workers=workers,
         cache=folder / "heard-rooms",
-        log=log,
+        log=folder / "redraw.jsonl",
     )
     return train_redraw(config, overwrite=True, report=report)
 

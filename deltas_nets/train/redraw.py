@@ -30,7 +30,7 @@ from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.lite.redraw import Redraw
-from deltas_nets.outputs.atomic_files import check_writable
+from deltas_nets.outputs.atomic_files import check_file, check_writable, remove_abandoned
 from deltas_nets.rooms import Rooms
 from deltas_nets.rooms.rooms import VERSION
 from deltas_nets.train.average import RunningAverage
@@ -82,7 +82,7 @@ def train_redraw(
     Args:
         config: what to do.
         device: where to compute.
-        overwrite: replace ``config.out`` if it exists.
+        overwrite: replace ``config.out`` and ``config.log`` if they exist.
         report: called after every room and every step.
 
     Returns:
@@ -94,12 +94,17 @@ def train_redraw(
     """
     check_new_weights(config.out, overwrite=overwrite)
     if config.log is not None:
-        check_writable(config.log.parent)
+        check_file(config.log)
+        if config.log.exists() and not overwrite:
+            raise UserError("the file exists", config.log, "add --overwrite or name a new --log")
     if config.cache is not None:
         check_writable(config.cache)
     model = with_redraw(load_model(config.init).to(device), weights_file(config.init))
     assert model.redraw is not None
     before = read_metadata(weights_file(config.init))
+    if config.log is not None:
+        config.log.parent.mkdir(parents=True, exist_ok=True)
+        config.log.write_text("")  # every training begins anew
     with tempfile.TemporaryDirectory() as temporary:
         heard = heard_rooms(model, config, config.cache or Path(temporary))
         for index in DataLoader(
@@ -159,6 +164,7 @@ def heard_rooms(model: Deltas, config: RedrawConfig, folder: Path) -> HeardRooms
         image_size=(height, width),
         close_ups=config.close_ups,
     )
+    remove_abandoned(folder / name)
     on_host = copy.deepcopy(model).cpu()  # its processes cannot share another device
     return HeardRooms(
         DisturbedRooms(rooms),

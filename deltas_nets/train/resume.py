@@ -3,40 +3,15 @@
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
 from deltas_nets.train.checkpoint import CONFIG, WEIGHTS, load_config
 
-Config = TypeVar("Config")
-
 OF_THE_MACHINE = ("devices", "num_nodes", "data.cache", "data.workers", "data.scannet.root")
 """Fields that change no result. The batch is that of all processes together, whatever their
 number."""
-
-
-def resumed_config(folder: Path, asked: TrainConfig, default: TrainConfig) -> TrainConfig:
-    """The config that a run goes on with: its own, and the machine's fields as asked.
-
-    Args:
-        folder: of the run.
-        asked: fields that differ from ``default`` are asked for.
-        default: what the command line had without options.
-
-    Raises:
-        UserError: a field is asked for that is not the run's; or there is no run.
-    """
-    config = load_config(folder)
-    usual = dict(_fields(default))
-    for name, value in _fields(asked):
-        if value == usual[name]:
-            continue
-        if name in OF_THE_MACHINE:
-            config = _with(config, name, value)
-        else:
-            _check(folder, name, config, value)
-    return config
 
 
 def check_continues(folder: Path, config: TrainConfig) -> None:
@@ -73,11 +48,3 @@ def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from _fields(value, f"{prefix}{field.name}.")
         else:
             yield prefix + field.name, value
-
-
-def _with(config: Config, name: str, value: Any) -> Config:
-    """A copy with another value of ``data.workers``."""
-    first, _, rest = name.partition(".")
-    inner = _with(getattr(config, first), rest, value) if rest else value
-    changed: Config = dataclasses.replace(config, **{first: inner})  # type: ignore[type-var]
-    return changed

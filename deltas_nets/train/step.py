@@ -195,7 +195,9 @@ def unreached(model: Network, config: TrainConfig) -> list[str]:
     views = PosedViews(K.repeat(2, 2, 1, 1), cam_from_world)
     depth = torch.full((2, 2, height, width), 2.0)
     batch = Batch(images, views, views, depth, torch.zeros(2, 2), images[:, 0])
-    Objective(trial, config)(batch).total.backward()
+    total = Objective(trial, config)(batch).total
+    if total.requires_grad:  # else no parameter is reached
+        total.backward()
     return [
         name
         for name, parameter in trial.named_parameters()

@@ -1,8 +1,9 @@
 """Configs: what is recorded comes back, nonsense is refused."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import inf, nan
+from pathlib import Path
 
 import pytest
 
@@ -17,7 +18,11 @@ from deltas_nets.config import (
     to_dict,
     without_paths,
 )
+from deltas_nets.config.redraw import RedrawConfig
 from deltas_nets.config.scannet import ScanNetConfig
+from deltas_nets.evaluate.rooms import CALIBRATION_SEEDS, EVALUATION_SEEDS
+from deltas_nets.export.agreement import ROOM_SEEDS
+from deltas_nets.train.fit import validation_rooms
 
 FRAMES = DataConfig(
     source="scannet",
@@ -60,6 +65,19 @@ def test_nonsense_is_refused_in_the_users_words() -> None:
     with pytest.raises(ValueError, match="offsets must name a line"):
         MatcherConfig(offsets=())
     TrainConfig(data=FRAMES, max_views=7)  # of rooms, 5 views are rendered
+
+
+def test_no_training_sees_a_room_that_is_measured_on() -> None:
+    measured = {*EVALUATION_SEEDS, *CALIBRATION_SEEDS, *ROOM_SEEDS}
+    first = validation_rooms().seed
+    measured |= set(range(first, first + len(validation_rooms())))
+    for seed in (min(measured), max(measured)):
+        with pytest.raises(ValueError, match=f"seed must be 1000 or more.*got {seed}"):
+            DataConfig(seed=seed)
+        with pytest.raises(ValueError, match=f"first_room must be 1000 or more.*got {seed}"):
+            RedrawConfig(Path("a.safetensors"), first_room=seed)
+    DataConfig(seed=max(measured) + 1)
+    replace(FRAMES, seed=0)  # of no rooms
 
 
 def numeric_fields(kind: type) -> list[tuple[type, str]]:

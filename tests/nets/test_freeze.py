@@ -11,6 +11,7 @@ from torch import nn
 
 from deltas_nets.config import CONFIGS, TrainConfig
 from deltas_nets.config.training import Stage
+from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.train.fit import Start
 from deltas_nets.train.freeze import frozen_stages
@@ -27,6 +28,17 @@ def test_stages_that_a_network_lacks_are_passed_over() -> None:
     model = nn.ModuleDict({"encoder": nn.Linear(1, 1)})
     assert frozen_stages(model, replace(CONFIG, freeze=("encoder", "judge"))) == [model["encoder"]]
     assert CONFIGS["deltas-resnet50"].matcher.kind == "per_view"  # and has no judge
+
+
+def test_something_is_left_that_learns(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="freeze must leave a stage that learns"):
+        replace(CONFIG, freeze=STAGES)
+    # The only stage left is one that the paper's networks lack.
+    network = replace(CONFIG.network, matcher=replace(CONFIG.network.matcher, kind="per_view"))
+    config = replace(CONFIG, network=network, freeze=tuple(s for s in STAGES if s != "judge"))
+    with pytest.raises(UserError, match="no loss teaches what is not frozen, --freeze encoder"):
+        train(tmp_path, config, Start())
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("freeze", [("encoder", "detector"), ("matcher", "judge", "densifier")])

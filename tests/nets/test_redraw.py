@@ -16,6 +16,7 @@ from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.captures.straight import straight
+from deltas_nets.errors import UserError
 from deltas_nets.network.build import build_stages
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth, as_points
@@ -261,7 +262,7 @@ def test_a_lesson_is_learned_and_nothing_else_changes(plain: Deltas, heard: Hear
 def test_the_stage_is_written_read_and_left_behind(plain: Deltas, tmp_path: Path) -> None:
     network = tmp_path / "network.safetensors"
     save_weights(network, plain, {"origin": "somewhere", "step": "7", "seed": "3"})
-    log, out = tmp_path / "log.jsonl", tmp_path / "redraws.safetensors"
+    log, out = tmp_path / "new" / "log.jsonl", tmp_path / "redraws.safetensors"
     train_redraw(small(out, init=str(network), seed=5, log=log))
     record, model = read_metadata(out), load_model(out)
     assert model.config.redraws and model.redraw is not None
@@ -269,6 +270,13 @@ def test_the_stage_is_written_read_and_left_behind(plain: Deltas, tmp_path: Path
     assert (record["origin"], record["step"], record["seed"]) == ("somewhere", "7", "3")
     assert len(log.read_text().splitlines()) == 1
     assert str(tmp_path) not in " ".join(record.values()) and "log" not in record["redraw_config"]
+    # Another training's log is neither added to nor lost unasked.
+    another = tmp_path / "another.safetensors"
+    with pytest.raises(UserError, match=r"the file exists.*log\.jsonl: add --overwrite"):
+        train_redraw(small(another, init=str(network), log=log))
+    assert not another.exists()
+    train_redraw(small(another, init=str(network), log=log), overwrite=True)
+    assert len(log.read_text().splitlines()) == 1
     # Training of all goes on without it: it follows features that are about to change.
     fresh = build_stages(plain.config)
     assert fresh.redraw is None
@@ -312,6 +320,9 @@ def test_wrong_use_is_told(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert_one_line(run("redraw", *flags), *words)
+    (tmp_path / "folder").mkdir()
+    assert_one_line(run("redraw", "--out", "w.safetensors", "--log", "folder"), "this is a folder")
+    (tmp_path / "folder").rmdir()
     assert not list(tmp_path.iterdir())
 
 

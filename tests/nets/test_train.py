@@ -138,6 +138,26 @@ def test_a_run_told_to_stop_finishes_its_step_and_goes_on_later(
     assert_same_state(tmp_path, unbroken)
 
 
+def test_a_run_told_to_stop_where_it_validates_is_saved_and_does_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take, saved = Stepper.__call__, []
+
+    def told(stepper: Stepper, batch: Batch, *, stop: bool) -> StepResult:
+        return take(stepper, batch, stop=stop)._replace(stop=True)
+
+    def validate(model: object) -> dict[str, float]:
+        saved.append(read_checkpoint(tmp_path)["step"])
+        return {}
+
+    monkeypatch.setattr(Stepper, "__call__", told)
+    monkeypatch.setattr(fit_module, "validate", validate)
+    with pytest.raises(KeyboardInterrupt):
+        fit(CONFIG, tmp_path, Start(), validate_every=1)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "validation" in line] == saved == [1]
+
+
 def test_a_finished_run_has_nothing_left_to_do(copy: Path) -> None:
     weights, log = copy / "weights.safetensors", copy / "log.jsonl"
     before = weights.read_bytes(), log.read_text()
@@ -266,10 +286,18 @@ def test_what_cannot_be_started_from_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "empty").exists()
 
 
-def test_a_damaged_checkpoint_is_an_error(copy: Path) -> None:
-    file = copy / "checkpoint.pt"
-    file.write_bytes(file.read_bytes()[:1000])
-    with pytest.raises(UserError, match=r"checkpoint is damaged .*checkpoint.pt"):
+@pytest.mark.parametrize("other", [{}, [1], {"model": 1}, 7])
+def test_another_file_of_torch_is_no_checkpoint(copy: Path, other: object) -> None:
+    torch.save(other, copy / "checkpoint.pt")
+    with pytest.raises(UserError, match=r"no checkpoint of a training.*checkpoint.pt: .*--init"):
+        fit(CONFIG, copy, Start(resume=True))
+
+
+@pytest.mark.parametrize("part", ["model", "average", "optimizer"])
+@pytest.mark.parametrize("wrong", [None, {}, torch.zeros(1)])
+def test_a_checkpoint_of_other_parts_is_refused(copy: Path, part: str, wrong: object) -> None:
+    torch.save(read_checkpoint(copy) | {part: wrong}, copy / "checkpoint.pt")
+    with pytest.raises(UserError, match=r"checkpoint of another version.*checkpoint.pt: "):
         fit(CONFIG, copy, Start(resume=True))
 
 
@@ -329,6 +357,21 @@ def test_mirrored_resized_and_reordered_rooms_stay_consistent() -> None:
     assert consistent_share(room) > 0.7
     assert consistent_share(first_of(changed)) > 0.7
     changed.views.check_values()
+
+
+def test_a_mirrored_camera_sees_mirrored_points_at_mirrored_pixels(rooms: PosedImages) -> None:
+    K = rooms.views.K.clone()
+    K[..., 0, 1] = torch.tensor([7.0, -3.0, 20.0])  # skew, px
+    skewed = rooms._replace(images=rooms.images / 255, views=rooms.views._replace(K=K))
+    mirrored = mirror(skewed, torch.tensor([True, True]))
+    # In front of all views of the first room, which stand a metre or less from view 0.
+    points = torch.tensor([[-0.5, 0.4, 3.0], [0.6, -0.5, 4.0], [0.1, 0.3, 5.0]])
+    world = skewed.views.cam_from_world[0, 0].inverse()
+    points = points @ world[:3, :3].T + world[:3, 3]
+    seen = project(first_of(skewed).views, points).pixels
+    reflected = project(first_of(mirrored).views, points * torch.tensor([-1.0, 1, 1])).pixels
+    expected = torch.stack([skewed.images.shape[-1] - 1 - seen[..., 0], seen[..., 1]], dim=-1)
+    torch.testing.assert_close(reflected, expected, rtol=0, atol=1e-2)  # px
 
 
 def test_mirroring_twice_changes_nothing(rooms: PosedImages) -> None:

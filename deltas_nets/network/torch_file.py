@@ -1,0 +1,60 @@
+"""Files of torch that others wrote, or a killed machine cut: none of them ends in a traceback."""
+
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from deltas_nets.errors import UserError
+
+__all__ = ["read_state", "read_torch_file"]
+
+NESTS = ("extractor", "state_dict", "model_state_dict", "model")
+"""Keys under which some authors keep the weights in their files."""
+
+
+def read_torch_file(file: Path, *, remedy: str) -> Any:
+    """The content of a ``.safetensors`` or PyTorch file; no code in the file is run.
+
+    Args:
+        file: to read.
+        remedy: what the user can do if it is no such file.
+
+    Raises:
+        UserError: the file is missing, damaged or of another kind.
+    """
+    try:
+        if file.suffix == ".safetensors":
+            return load_file(file)
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise UserError("no such weights", file, remedy) from None
+    except (OSError, EOFError, RuntimeError, ValueError, KeyError) as error:
+        raise UserError(f"the weights cannot be read ({_short(error)})", file, remedy) from None
+    except Exception as error:  # a damaged pickle may raise anything
+        raise UserError(f"not a file of weights alone ({_short(error)})", file, remedy) from None
+
+
+def read_state(
+    file: Path, *, remedy: str = "name a file of weights (.safetensors, .pt or .pth)"
+) -> dict[str, Tensor]:
+    """The named tensors of a file.
+
+    Raises:
+        UserError: the file is missing, or holds anything but tensors by name.
+    """
+    content = read_torch_file(file, remedy=remedy)
+    for name in NESTS:
+        if isinstance(content, dict) and isinstance(content.get(name), dict):
+            content = content[name]
+    if not isinstance(content, dict):
+        raise UserError("the file holds no weights by name", file, remedy)
+    return {name: value for name, value in content.items() if isinstance(value, Tensor)}
+
+
+def _short(error: Exception) -> str:
+    """The beginning of what torch says, which goes on for a page of advice."""
+    return shorten(str(error).partition("\n")[0], 150, placeholder=" ...")
