@@ -41,7 +41,8 @@ class Prediction(Command):
     depth_range: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
     """Nearest and farthest depth searched, metres; 0.5 10 if not given."""
     work_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="HEIGHT WIDTH")] = None
-    """What the network sees; chosen to suit it if not given."""
+    """What the network sees; chosen to suit it if not given. Of less than 192 256 maps are worse
+    than the confidence that they state."""
     debug: Flag = False
     """Show the traceback of an error."""
 
