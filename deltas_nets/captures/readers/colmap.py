@@ -73,8 +73,9 @@ def _find_images(
     """The images of a model, None where there is none, and a warning of those that are guessed."""
     around = [each for each in (folder, *folder.parents) if each.is_relative_to(capture)]
     roots = [each / name for each in around for name in IMAGE_FOLDERS]
-    finder = FileFinder(capture, [*roots, *around])
-    return [finder.find(name) for name in model.images.names], finder.doubts()
+    names = model.images.names
+    finder = FileFinder(capture, [*roots, *around], names=names)
+    return [finder.find(name) for name in names], finder.doubts()
 
 
 def capture_of_model(

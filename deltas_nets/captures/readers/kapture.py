@@ -62,8 +62,9 @@ def read(path: Path) -> Capture:
     rigs = _rigs(folder / "rigs.txt")
     records = folder / "records_camera.txt"
     rows = list(_rows(records, 3))
-    ids = frame_ids([words[2] for _, words in rows], records)
-    finder = FileFinder(path, (folder / "records_data",))
+    names = [words[2] for _, words in rows]
+    ids = frame_ids(names, records)
+    finder = FileFinder(path, (folder / "records_data",), names=names)
     found = Collected(records)
     for id, (number, (stamp, device, name, *_)) in zip(ids, rows, strict=True):
         if device not in sensors:
