@@ -35,7 +35,8 @@ def wrong_sizes(capture: Capture) -> list[Finding]:
     )
     turned = size == frame.image_size[::-1]
     right = _of_file(frame, size)
-    cure = f"state width {size[1]} and height {size[0]} with {in_a_line(right.K)}"
+    cure = f"state width {size[1]} and height {size[0]} with "
+    cure += in_a_line(right.K, capture.form.centre)
     cause = Fault.SIDES_SWAPPED if turned else Fault.IMAGES_UNREADABLE
     ids = () if len(wrong) == len(capture.frames) else tuple(wrong)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapModel, k_and_lens
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
@@ -132,6 +133,7 @@ def capture_of_model(
         layout=f"COLMAP {'binary' if is_binary(folder) else 'text'}",
         metric=False,
         points=_points(model, packed, frame_of_image, scales),
+        form=FileForm(centre=0.5),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.readers.files import FileFinder
@@ -25,6 +26,7 @@ from deltas_nets.captures.readers.own_cameras import (
     OwnCamera,
     depth_camera,
     named_cameras,
+    pixel_centre,
     sized,
     stated_camera,
 )
@@ -99,6 +101,7 @@ def read(path: Path) -> Capture:
         points=read_points(root, file.parent, ids, packed, scales),
         sources=_sources(used, list(packed), ids),
         depth_ranges=_depth_ranges(root, used),
+        form=FileForm(centre=pixel_centre(root)),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.points import SparsePoints
@@ -120,6 +121,7 @@ def read(path: Path) -> Capture:
         layout=files[0].name,
         metric=_metric(root, entries),
         points=points,
+        form=FileForm(opengl=True, centre=0.5),
     )
 
 
