@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deltas_nets.captures.file_form import OURS, FileForm
 from deltas_nets.captures.frame import FloatArray as FloatArray
 from deltas_nets.captures.frame import Frame as Frame
 from deltas_nets.captures.frames import Frames
@@ -64,6 +65,8 @@ class Capture:
     that are to have no map. Of frames that are not there it says nothing."""
     depth_ranges: FloatArray | None = None
     """``(F, 2)`` nearest and farthest depth of each frame, if its program states them."""
+    form: FileForm = OURS
+    """How its files say cameras."""
 
     def fingerprint(self) -> str:
         """A hash of all cameras: what changes when poses or intrinsics do."""

@@ -17,6 +17,7 @@ from deltas_nets.captures.images import (
     header_of_whole_file,
     in_words,
     is_8_bit,
+    orientation_of,
     resize_image,
 )
 from deltas_nets.errors import UserError
@@ -149,7 +150,11 @@ class Frame:
         if header.size != self.image_size:
             what = f"image is {in_words(header.size)}, the intrinsics are for "
             what += in_words(self.image_size)
-            raise UserError(what, self.image_path, "export all images of a capture at one size")
+            remedy = "export all images of a capture at one size"
+            if orientation_of(self.image_path, self.image_span) != 1:
+                what += "; its EXIF says that it is to be turned, which is not followed"
+                remedy = "turn the file as its EXIF says, or leave it out"
+            raise UserError(what, self.image_path, remedy)
 
     def _depth_path(self) -> Path:
         if self.depth_path is None:

@@ -10,7 +10,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from deltas_nets.errors import UserError
 
@@ -26,6 +26,7 @@ __all__ = [
     "in_words",
     "is_8_bit",
     "open_span",
+    "orientation_of",
     "resize_image",
     "why_not_decoded",
 ]
@@ -174,6 +175,15 @@ def image_size_of(path: Path) -> tuple[int, int] | None:
             return image.height, image.width
     except _UNREADABLE:
         return None
+
+
+def orientation_of(path: Path, span: Span | None = None) -> int:
+    """How EXIF says that a file is to be turned, which nothing here follows; 1 is upright."""
+    try:
+        with Image.open(path if span is None else open_span(path, span)) as image:
+            return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+    except (*_UNREADABLE, ValueError, TypeError):
+        return 1
 
 
 def in_words(size: tuple[int, int]) -> str:

@@ -9,16 +9,28 @@ import numpy as np
 import torch
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.known_depths import points_in_view
 from deltas_nets.captures.straight import StraightFrame, straight, straight_pixels
 from deltas_nets.captures.text_lines import read_lines
 from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.captures.working_depth import working_depths
 from deltas_nets.errors import UserError
 
-__all__ = ["ByHand", "Measured", "MeasuredDepth", "OfPoints", "OfSensor", "measured_by_hand"]
+__all__ = [
+    "ByHand",
+    "Measured",
+    "MeasuredDepth",
+    "OfPoints",
+    "OfSensor",
+    "doubtful_unit",
+    "measured_by_hand",
+]
 
 FORM = "write lines ID X Y METRES: a frame, a pixel and its depth"
+AWAY = 30.0
+"""Times as far as anything of the capture: centimetres are a hundred times as many as metres."""
 
 
 class MeasuredDepth(NamedTuple):
@@ -140,13 +152,39 @@ def measured_by_hand(file: Path, capture: Capture) -> dict[str, FloatArray]:
         except ValueError as error:
             raise UserError(f"line {number} is not ID X Y METRES", file, FORM) from error
         id = " ".join([first, *more])
-        height, width = capture.frame(id).image_size
+        frame = _named(id, number, file, capture)
+        height, width = frame.image_size
         if not 0 < metres < math.inf:
             raise UserError(f"line {number}: {metres:g} m is no depth", file, FORM)
         if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
             what = f"line {number}: pixel ({x:g}, {y:g}) is outside of frame {id}, {width}x{height}"
             raise UserError(what, file, "give pixels of the photo: x to the right, y down")
-        found.setdefault(capture.frame(id).id, []).append([x, y, metres])
+        found.setdefault(frame.id, []).append([x, y, metres])
     if not found:
         raise UserError("the file of measured depths is empty", file, FORM)
     return {id: np.array(rows) for id, rows in found.items()}
+
+
+def _named(id: str, number: int, file: Path, capture: Capture) -> Frame:
+    try:
+        return capture.frame(id)
+    except UserError as error:
+        raise UserError(f"line {number}: {error.what}", file, error.remedy) from error
+
+
+def doubtful_unit(rows: Mapping[str, FloatArray], capture: Capture) -> str | None:
+    """Words for measured depths that are hardly in metres, beside a capture that is.
+
+    Args:
+        rows: X Y METRES ``(D, 3)`` of each frame.
+        capture: its surfaces, as far as it knows them, and its cameras say what is far and near.
+    """
+    measured = float(np.median(np.concatenate([each[:, 2] for each in rows.values()])))
+    usual = float(np.median(working_depths(capture)))
+    extent = float(np.ptp(camera_centres(capture.frames.cam_from_world), axis=0).max())
+    if min(usual, extent) / AWAY <= measured <= max(usual, extent) * AWAY:
+        return None
+    return (
+        f"measured depths are {measured:.4g} m (median), but surfaces of the capture about "
+        f"{usual:.2g} m away and its cameras {extent:.2g} m apart: are they in metres?"
+    )

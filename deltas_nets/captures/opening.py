@@ -198,7 +198,11 @@ def _read(reader: Reader, path: Path, intrinsics: Intrinsics | None) -> Capture:
     frames = (
         replace(frame, K=intrinsics.K, lens=intrinsics.lens) for frame in capture.frames.values()
     )
-    return replace(capture, frames=Frames.of(frames, capture.frames.folder))
+    return replace(
+        capture,
+        frames=Frames.of(frames, capture.frames.folder),
+        form=capture.form._replace(centre=0.0),  # the user's words, no file's
+    )
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.mending import changing_poses
@@ -26,7 +27,7 @@ class _Axes(NamedTuple):
 
     Attributes:
         inverted: whether they are world-to-camera in the place of camera-to-world.
-        ours: ``(4, 4)`` a signed permutation: our camera's axes from theirs.
+        ours: ``(4, 4)`` a signed permutation: the camera axes that files should have from theirs.
     """
 
     inverted: bool
@@ -38,16 +39,15 @@ class _Axes(NamedTuple):
         return bool(np.linalg.det(self.ours) < 0)
 
     def mended(self, poses: FloatArray) -> FloatArray:
-        """``(F, 4, 4)`` cam_from_world as we write it."""
+        """``(F, 4, 4)`` cam_from_world with the axes that files should have."""
         given = np.linalg.inv(poses) if self.inverted else poses
         mended: FloatArray = self.ours @ given @ (MIRROR if self.left_handed else np.eye(4))
         return mended
 
-    @property
-    def in_words(self) -> str:
-        """Where their axes point."""
+    def in_words(self, form: FileForm) -> str:
+        """Where their axes point, in files of a form."""
         ways = []
-        for column in self.ours[:3, :3].T:
+        for column in (form.axes @ self.ours)[:3, :3].T:
             axis = int(np.abs(column).argmax())
             ways.append(WAYS[axis][int(column[axis] < 0)])
         return f"x {ways[0]}, y {ways[1]}, z {ways[2]}"
@@ -75,8 +75,9 @@ def other_axes(case: Case) -> Suspect | None:
         explains = found.explains and found.after <= _LEFT * found.given
         # Cameras that hardly turn fit several: the first is the simplest.
         if explains and (best is None or found.after < 0.8 * best.tried.after):
-            cause = Fault.OTHER_AXES
-            what = f"axes as {axes.in_words} fit: {found.in_words}"
+            form = case.capture.form
+            cause = Fault.OTHER_AXES_THAN_OPENGL if form.opengl else Fault.OTHER_AXES
+            what = f"axes as {axes.in_words(form)} fit: {found.in_words}"
             best = Suspect(found, Finding(cause, what, (), axes.cure, "error", mend))
     return best
 

@@ -76,8 +76,9 @@ def unregistered_depth(
         f"depth agrees {how} best for a focal length of {right[0, 0]:.4g} px, {factor:.3g} times "
         f"the {K[0, 0]:.4g} px that the capture says{kinect}"
     )
+    K_in_words = in_a_line(right, capture.form.centre)
     cure = (
-        f"state the depth camera's intrinsics: {in_a_line(right)} for depth of "
+        f"state the depth camera's intrinsics: {K_in_words} for depth of "
         f"{known[position].depth.shape[1]}x{known[position].depth.shape[0]} (in ScanNet's layout "
         "intrinsic/intrinsic_depth.txt), or register depth to the images"
     )

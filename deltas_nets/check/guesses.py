@@ -27,12 +27,12 @@ def improved_guess(
     rest = [one for one in found if one is not of_K]
     if of_K is None or of_K.mend is None or guess.mend is None:
         if not any(one.severity == "error" for one in found) and guess.mend is not None:
-            K = in_a_line(guessed.frames.K[0])
+            K = in_a_line(guessed.frames.K[0], guessed.form.centre)
             guess = guess._replace(cure=f"{guess.cure}; matches fit {K}")
         return guess, rest
     right = of_K.mend(guessed).frames
     position = list(right).index(of_K.frames[0]) if of_K.frames else 0
-    K = in_a_line(right.K[position])
+    K = in_a_line(right.K[position], guessed.form.centre)
     evidence = f"{guess.evidence}; matches fit {K}"
     return guess._replace(
         evidence=evidence, cure=f"write K as {K}", mend=_both(guess.mend, of_K.mend)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.images import image_size_of, in_words
+from deltas_nets.captures.images import image_size_of, in_words, orientation_of
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.intrinsics import in_a_line
 from deltas_nets.check.mending import changing_frames
@@ -35,7 +35,11 @@ def wrong_sizes(capture: Capture) -> list[Finding]:
     )
     turned = size == frame.image_size[::-1]
     right = _of_file(frame, size)
-    cure = f"state width {size[1]} and height {size[0]} with {in_a_line(right.K)}"
+    cure = f"state width {size[1]} and height {size[0]} with "
+    cure += in_a_line(right.K, capture.form.centre)
+    exif = [id for id in wrong if orientation_of(capture.frames[id].image_path) > 1]
+    if turned and exif:
+        cure = f"turn {ids_in_words(exif, 20)} as EXIF says, which is not followed"
     cause = Fault.SIDES_SWAPPED if turned else Fault.IMAGES_UNREADABLE
     ids = () if len(wrong) == len(capture.frames) else tuple(wrong)
 

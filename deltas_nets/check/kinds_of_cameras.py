@@ -84,12 +84,11 @@ def wrong_kinds(capture: Capture, matched: Matched, evidence: Evidence) -> Itera
                 middle = off_middle(
                     way.of_frame(frames.K[index], factor), frames.at(index).image_size
                 )
-                suspects[middle] = Suspect(
-                    found, _finding(frames, group, way, factor, found.in_words)
-                )
+                finding = _finding(capture, group, way, factor, found.in_words)
+                suspects[middle] = Suspect(found, finding)
         # Of two that fit alike, the one that leaves the principal point nearer to the middle.
         yield from (suspects[middle] for middle in sorted(suspects))
-    yield from _swapped(frames, matched, evidence, given)
+    yield from _swapped(capture, matched, evidence, given)
 
 
 def kinds_of(frames: Frames) -> NDArray[np.int64]:
@@ -103,22 +102,25 @@ def kinds_of(frames: Frames) -> NDArray[np.int64]:
 
 
 def _finding(
-    frames: Frames, group: NDArray[np.bool_], way: _Way, factor: float, figures: str
+    capture: Capture, group: NDArray[np.bool_], way: _Way, factor: float, figures: str
 ) -> Finding:
+    frames = capture.frames
     ids = () if group.all() else tuple(frames.kept(group))
     position = int(np.flatnonzero(group)[0])
     right = {int(index): way.of_frame(frames.K[index], factor) for index in np.flatnonzero(group)}
     cause = way.cause if group.all() else Fault.K_OF_SOME_FRAMES
     whose = "" if group.all() else f" of {len(ids)} frames ({ids_in_words(ids)})"
     evidence = f"{way.what}{whose} times {factor:.4g} fits: {figures}"
-    cure = f"multiply {way.what}{whose} by {factor:.4g}: {in_a_line(right[position])}"
+    cure = f"multiply {way.what}{whose} by {factor:.4g}: "
+    cure += in_a_line(right[position], capture.form.centre)
     return Finding(cause, evidence, ids, cure, "error", changing_frames(with_K(right)))
 
 
 def _swapped(
-    frames: Frames, matched: Matched, evidence: Evidence, given: Tensor
+    capture: Capture, matched: Matched, evidence: Evidence, given: Tensor
 ) -> Iterator[Suspect]:
     """K of images of swapped width and height."""
+    frames = capture.frames
     views = matched.views(frames)
     K = torch.stack(
         [
@@ -133,7 +135,7 @@ def _swapped(
     found = tried(evidence, given, PosedViews(K, views.cam_from_world))
     if found.explains:
         right: dict[int, Any] = {index: swapped(K) for index, K in enumerate(frames.K)}
-        cure = f"exchange fx with fy and cx with cy: {in_a_line(right[0])}"
+        cure = f"exchange fx with fy and cx with cy: {in_a_line(right[0], capture.form.centre)}"
         mend = changing_frames(with_K(right))
         what = f"K with x and y exchanged fits: {found.in_words}"
         yield Suspect(found, Finding(Fault.SIDES_SWAPPED, what, (), cure, "error", mend))

@@ -15,11 +15,14 @@ __all__ = ["changing_frames", "changing_poses", "leaving_out", "scaling_poses"]
 
 
 def changing_poses(change: Callable[[FloatArray], FloatArray]) -> Mend:
-    """A mend by a function of all poses ``(F, 4, 4)``, cam_from_world."""
+    """A mend by a function of all poses ``(F, 4, 4)``, cam_from_world with the files' axes.
+
+    What went wrong went wrong in the files: a transpose in OpenGL's axes is none in ours.
+    """
 
     def mend(capture: Capture) -> Capture:
-        frames = capture.frames
-        poses = change(frames.cam_from_world.copy())
+        frames, axes = capture.frames, capture.form.axes
+        poses = axes @ change(axes @ frames.cam_from_world)
         arrays = frames.arrays._replace(cam_from_world=poses)
         return replace(capture, frames=Frames(frames.folder, arrays, memory=frames.memory))
 

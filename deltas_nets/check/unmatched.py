@@ -1,10 +1,8 @@
 """Frames that match none of those around them, though these match each other."""
 
-from PIL import ExifTags, Image
-
-from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.captures.images import open_span
+from deltas_nets.captures.images import orientation_of
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.matched import Matched
 from deltas_nets.check.mending import leaving_out
@@ -19,7 +17,11 @@ def unmatched_frames(capture: Capture, matched: Matched) -> list[Finding]:
     frames = [capture.frames.at(position) for position in matched.alone]
     ids = tuple(frame.id for frame in frames)
     evidence = f"{ids_in_words(ids)}: the frames before and after match each other"
-    turned = {frame.id: turn for frame in frames if (turn := _orientation(frame)) != 1}
+    turned = {
+        frame.id: turn
+        for frame in frames
+        if (turn := orientation_of(frame.image_path, frame.image_span)) != 1
+    }
     cure = f"see whether the image is of that frame; else leave out {ids_in_words(ids, 20)}"
     if turned:
         id, turn = next(iter(turned.items()))
@@ -27,12 +29,3 @@ def unmatched_frames(capture: Capture, matched: Matched) -> list[Finding]:
         cure = f"turn {ids_in_words(turned, 20)} as EXIF says, which is not followed, or leave out "
         cure += ids_in_words(ids, 20)
     return [Finding(Fault.FRAMES_UNMATCHED, evidence, ids, cure, "warning", leaving_out(ids))]
-
-
-def _orientation(frame: Frame) -> int:
-    """As EXIF has it; 1 is upright, and what a file without EXIF is."""
-    try:
-        with Image.open(open_span(frame.image_path, frame.image_span)) as image:
-            return int(image.getexif().get(ExifTags.Base.Orientation, 1))
-    except (OSError, SyntaxError, ValueError, TypeError):
-        return 1

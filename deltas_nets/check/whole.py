@@ -21,7 +21,7 @@ __all__ = ["diagnosed", "of_all_cameras"]
 
 
 class _Known(NamedTuple):
-    """How a cause of `diagnose` is said of a capture.
+    """How a cause of `diagnose` is said of a capture, whose files have our axes.
 
     Attributes:
         fault: what.
@@ -45,18 +45,29 @@ KNOWN = {
         "(poses are inverted, with OpenGL's axes)",
     ),
     Cause.ROTATIONS_TRANSPOSED: _Known(
-        Fault.ROTATIONS_TRANSPOSED, "transpose the rotation of each pose"
+        Fault.ROTATIONS_TRANSPOSED, "transpose the rotation of each world-to-camera matrix"
     ),
     Cause.ROTATIONS_INVERTED: _Known(
         Fault.ROTATIONS_INVERTED,
         "transpose the rotation of each camera-to-world matrix; camera centres stay as they are",
     ),
     Cause.CENTERS_AS_TRANSLATIONS: _Known(
-        Fault.CENTERS_AS_TRANSLATIONS, "write t = -R C, C being what stands there now"
+        Fault.CENTERS_AS_TRANSLATIONS,
+        "in each world-to-camera matrix write t = -R C, C being what stands there now",
     ),
     Cause.K_TRANSPOSED: _Known(Fault.K_TRANSPOSED, "transpose K: fx 0 cx, 0 fy cy, 0 0 1"),
 }
 """Causes of all cameras that need no search."""
+OF_OPENGL = {
+    Cause.POSES_INVERTED: KNOWN[Cause.POSES_INVERTED]._replace(cure="invert each pose"),
+    Cause.OPENGL_AXES: KNOWN[Cause.OPENGL_AXES]._replace(fault=Fault.OPENCV_AXES),
+    Cause.OPENGL_WORLD_FROM_CAM: KNOWN[Cause.OPENGL_WORLD_FROM_CAM]._replace(
+        cure="invert each pose, then negate the second and third column of camera-to-world "
+        "(poses are inverted, with OpenCV's axes)"
+    ),
+}
+"""Those that are said otherwise where files have OpenGL's axes, as every format of such has
+camera-to-world matrices."""
 
 
 def diagnosed(capture: Capture, matched: Matched) -> Diagnosis:
@@ -68,7 +79,8 @@ def diagnosed(capture: Capture, matched: Matched) -> Diagnosis:
 
 def of_all_cameras(case: Case) -> Iterator[Suspect]:
     """Causes of all cameras that explain residuals, each judged by what its mend makes of files."""
-    for cause, known in KNOWN.items():
+    said = KNOWN | OF_OPENGL if case.capture.form.opengl else KNOWN
+    for cause, known in said.items():
         mend = _mend(cause)
         found = case.mended(mend)
         if found.explains:

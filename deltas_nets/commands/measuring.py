@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
@@ -32,7 +33,13 @@ class Measuring:
         Raises:
             UserError: the capture has none, or the file is malformed.
         """
-        from deltas_nets.captures.measured import ByHand, OfPoints, OfSensor, measured_by_hand
+        from deltas_nets.captures.measured import (
+            ByHand,
+            OfPoints,
+            OfSensor,
+            doubtful_unit,
+            measured_by_hand,
+        )
 
         name, deviation = str(self.sensor_depth), self.sensor_deviation
         if self.sensor_depth is None:
@@ -54,6 +61,9 @@ class Measuring:
                 raise UserError(what, capture.path, "leave out --sensor-depth")
             return OfPoints(capture, deviation or POINTS)
         rows = measured_by_hand(self.sensor_depth, capture)
+        doubt = doubtful_unit(rows, capture)
+        if doubt is not None:
+            warn(f"{doubt} ({self.sensor_depth})")
         return ByHand(capture, rows, deviation or HAND)
 
     def check_completes(self, measured: "Measured", capture: "Capture", anchors: list[str]) -> None:

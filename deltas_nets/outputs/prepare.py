@@ -68,7 +68,7 @@ def prepare_output(
     wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
     _check_no_capture(out, forbidden)
     check_writable(out)
-    earlier = _earlier(out, wanted, overwrite=overwrite)
+    earlier = _earlier(out, wanted, (head or {}).get("scaled_by"), overwrite=overwrite)
     folder = OutputFolder(
         out,
         options=options,
@@ -114,7 +114,9 @@ def _check_no_capture(out: Path, forbidden: Path | None) -> None:
         raise UserError("the output folder is a capture", out, "name another folder with --out")
 
 
-def _earlier(out: Path, wanted: Mapping[str, Any], *, overwrite: bool) -> list[dict[str, Any]]:
+def _earlier(
+    out: Path, wanted: Mapping[str, Any], scaled_by: float | None, *, overwrite: bool
+) -> list[dict[str, Any]]:
     """The summaries of earlier runs, which this one continues unless it overwrites.
 
     Raises:
@@ -131,7 +133,7 @@ def _earlier(out: Path, wanted: Mapping[str, Any], *, overwrite: bool) -> list[d
         what = f"the output folder holds something else ({', '.join(others[:3])})"
         raise UserError(what, out, "name an empty folder, or add --overwrite")
     if earlier and earlier[0]["settings"] != wanted:
-        what = f"an earlier run had other settings ({difference(earlier[0], wanted)})"
+        what = f"an earlier run had other settings ({difference(earlier[0], wanted, scaled_by)})"
         raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
     return earlier
 

@@ -89,11 +89,22 @@ OPTIONS = {
 """What states a setting; of the others an option of the same name does."""
 
 
-def difference(earlier: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """The settings that differ, by the options that state them: ``--views was 3, is 5``."""
+def difference(
+    earlier: Mapping[str, Any], wanted: Mapping[str, Any], scaled_by: float | None = None
+) -> str:
+    """The settings that differ, by the options that state them: ``--views was 3, is 5``.
+
+    Args:
+        earlier: the summary of the run before.
+        wanted: settings of now.
+        scaled_by: what the capture is multiplied with now: cameras differ by that.
+    """
     before, after = _flat(earlier["settings"]), _flat(wanted)
     names = sorted(before.keys() | after.keys())
     words: dict[str, str] = {}
+    scale = earlier.get("scaled_by")
+    if scale is not None and scaled_by is not None and scale != scaled_by:
+        words["--scale or --scale-from"] = f"was {scale:.6g}, is {scaled_by:.6g}"
     for name in (name for name in names if before.get(name) != after.get(name)):
         option = OPTIONS.get(name, f"--{name.replace('_', '-')}")
         was, now = json.dumps(before.get(name)), json.dumps(after.get(name))

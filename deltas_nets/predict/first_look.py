@@ -20,6 +20,7 @@ from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Followed
+from deltas_nets.terminal import warn
 
 __all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor"]
 
@@ -28,6 +29,8 @@ ANCHORS = 5
 ROUNDS = 3
 """At most, until views chosen for a depth find that depth."""
 AGREES = 1.4
+NEARLY = 1.5
+"""Metres that a unit of a metric capture may be: what phones measure drifts."""
 ENOUGH = 50
 """Pixels where map and sensor are compared."""
 
@@ -95,7 +98,7 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
     if len(ratios) < ENOUGH:
         what, remedy = "no sensor depth tells the scale", "give --scale METRES_PER_UNIT"
         raise UserError(what, capture.path, remedy)
-    return float(np.median(ratios))
+    return _doubted(float(np.median(ratios)), capture, "its sensor depth")
 
 
 def scale_by_measurements(
@@ -123,7 +126,17 @@ def scale_by_measurements(
                 what = f"no depth was found at pixel ({x:g}, {y:g}) of frame {id}"
                 raise UserError(what, file, "measure nearer to the middle of the photo")
             ratios.append(metres / found)
-    return float(np.median(ratios))
+    return _doubted(float(np.median(ratios)), capture, str(file))
+
+
+def _doubted(unit: float, capture: Capture, source: str) -> float:
+    """Metres in a unit of the capture, with a warning where it says that there is one."""
+    if capture.metric and not 1 / NEARLY < unit < NEARLY:
+        warn(
+            f"the capture is in metres already, and a unit of it is {unit:.4g} m by {source}: "
+            "is that in metres?"
+        )
+    return unit
 
 
 def _whole(config: PredictConfig) -> PredictConfig:

@@ -118,9 +118,11 @@ def test_nothing_is_said_of_matches_where_no_image_can_be_read(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("given", "named"), [(4.0, False), (6.0, True)])
-def test_of_so_many_axes_one_must_leave_a_quarter(given: float, named: bool) -> None:
+def test_of_so_many_axes_one_must_leave_a_quarter(given: float, named: bool, few: Looked) -> None:
     class OneFits:
         """All axes leave 1.2 px of it: less than half of 4 px, less than a quarter of 6."""
+
+        capture = few[0]
 
         def mended(self, mend: object) -> Tried:
             return Tried(given, 1.2)

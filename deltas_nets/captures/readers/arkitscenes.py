@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
 from deltas_nets.captures.readers.collected import Collected
@@ -68,7 +69,7 @@ def read(path: Path) -> Capture:
             stated=size,
             depth=depths_at[depth_of[place]] if depth_of[place] >= 0 else None,
         )
-    return found.capture(folder, "ARKitScenes", metric=True)
+    return found.capture(folder, "ARKitScenes", metric=True, form=FileForm(centre=CORNER))
 
 
 def _folder(path: Path) -> Path | None:

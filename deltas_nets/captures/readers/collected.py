@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.file_form import OURS, FileForm
 from deltas_nets.captures.frame import FloatArray, Frame, Lens
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
@@ -98,7 +99,13 @@ class Collected:
         )
 
     def capture(
-        self, folder: Path, layout: str, *, metric: bool, doubts: Sequence[str] = ()
+        self,
+        folder: Path,
+        layout: str,
+        *,
+        metric: bool,
+        doubts: Sequence[str] = (),
+        form: FileForm = OURS,
     ) -> Capture:
         """All that was found.
 
@@ -107,6 +114,7 @@ class Collected:
             layout: the format's name.
             metric: whether its unit is the metre.
             doubts: besides those of sizes.
+            form: how its files say cameras.
         """
         return Capture(
             folder,
@@ -115,4 +123,5 @@ class Collected:
             (*doubts_of_sizes(self._sized), *doubts),
             layout,
             metric,
+            form=form,
         )

@@ -13,6 +13,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapModel, k_and_lens
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.ids import ids_in_words
@@ -73,8 +74,9 @@ def _find_images(
     """The images of a model, None where there is none, and a warning of those that are guessed."""
     around = [each for each in (folder, *folder.parents) if each.is_relative_to(capture)]
     roots = [each / name for each in around for name in IMAGE_FOLDERS]
-    finder = FileFinder(capture, [*roots, *around])
-    return [finder.find(name) for name in model.images.names], finder.doubts()
+    names = model.images.names
+    finder = FileFinder(capture, [*roots, *around], names=names)
+    return [finder.find(name) for name in names], finder.doubts()
 
 
 def capture_of_model(
@@ -131,6 +133,7 @@ def capture_of_model(
         layout=f"COLMAP {'binary' if is_binary(folder) else 'text'}",
         metric=False,
         points=_points(model, packed, frame_of_image, scales),
+        form=FileForm(centre=0.5),
     )
 
 

@@ -9,11 +9,13 @@ from functools import cached_property
 from pathlib import Path
 
 from deltas_nets.captures.readers.names import IMAGE_SUFFIXES, name_parts, where_to_put
+from deltas_nets.captures.readers.our_outputs import is_ours
+from deltas_nets.captures.readers.owners import AS_NAMED, Claim, Owners
 from deltas_nets.errors import UserError
 
 __all__ = ["NOT_COLOUR", "FileFinder"]
 
-NOT_COLOUR = ("depth", "mask", "normal", "confidence", "semantic", "segment", ".")
+NOT_COLOUR = ("depth", "mask", "normal", "confidence", "semantic", "segment", "preview", ".")
 """How names of folders begin in which no colour image is looked for."""
 FILES_LIMIT = 10**6
 """Files that a folder may hold where names are searched in it."""
@@ -28,16 +30,18 @@ class FileFinder:
     which accents are written (macOS writes them apart), with a suffix added where it has none. The
     file that agrees in most parts is taken, then the one under an earlier root; where two are as
     good none is, but for copies in images_2, images_4, ..., of which the largest is. An image whose
-    suffix alone is another is taken from the folder that is named. `doubts` tells of both.
+    suffix alone is another is taken from the folder that is named. `doubts` tells of both. A file
+    that another name of the capture means is taken for none but that (`Owners`).
 
     Found files are in the folder of the capture or, if the name says so by "..", in the one around
     it, and never elsewhere: absolute paths are searched by their last parts, too. Links to files
     are followed, and so are links that are roots; other links to folders are not, so that no
-    cycle and no whole disk is walked.
+    cycle and no whole disk is walked. Folders that commands of ours filled are not searched.
 
     Args:
         folder: of the capture.
         roots: folders to look in, best first; those that do not exist are skipped.
+        names: all that will be asked for, where they are known before.
         suffixes: of the files.
         avoid: how names of folders begin, in lower case, that are not searched.
 
@@ -50,11 +54,13 @@ class FileFinder:
         folder: Path,
         roots: Sequence[Path] = (),
         *,
+        names: Sequence[str] = (),
         suffixes: Sequence[str] = IMAGE_SUFFIXES,
         avoid: Sequence[str] = NOT_COLOUR,
     ) -> None:
         self.folder = folder
         self.roots = [root for root in (*roots, folder) if root.is_dir()]
+        self.names = names
         self.suffixes = tuple(suffixes)
         self.avoid = tuple(avoid)
         self._folders: dict[str, frozenset[str]] = {}
@@ -71,10 +77,7 @@ class FileFinder:
         parts = name_parts(name)
         if not parts:
             return None
-        found = self._as_named(name)
-        if found is None:
-            wanted = tuple(map(_folded, parts))
-            found = self._by_last_parts(name, wanted) or self._by_another_suffix(name, wanted)
+        found = self._as_named(name) or self._searched(name, tuple(map(_folded, parts)))
         if found is None or found == apart_from:
             self._missing.append(name)
             return None
@@ -134,27 +137,48 @@ class FileFinder:
         around = os.path.dirname(os.path.abspath(self.folder))
         return os.path.abspath(file).startswith(os.path.join(around, ""))
 
-    def _by_last_parts(self, name: str, wanted: Sequence[str]) -> Path | None:
+    def _searched(self, name: str, wanted: tuple[str, ...]) -> Path | None:
+        claim = self._claim(wanted)
+        if claim is None or not self._owners.allow(claim, wanted):
+            return None
+        if claim.guessed:
+            self._guesses.append((name, claim.path))
+        return claim.path
+
+    @cached_property
+    def _owners(self) -> Owners:
+        """Looked for where a file is not as it is named: most captures have none."""
+        owners = Owners()
+        for name in self.names:
+            wanted = tuple(map(_folded, name_parts(name)))
+            file = self._as_named(name)
+            claim = Claim(file, AS_NAMED) if file else self._claim(wanted) if wanted else None
+            if claim is not None:
+                owners.add(claim, wanted)
+        return owners
+
+    def _claim(self, wanted: tuple[str, ...]) -> Claim | None:
+        """The file that the parts of a name mean, whoever else does."""
         names = [wanted[-1]]
         if not names[0].endswith(self.suffixes):
             names = [names[0] + known for known in self.suffixes]
         for last in names:
-            winners = self._nearest((*wanted[:-1], last))
+            agreeing, winners = self._nearest((*wanted[:-1], last))
             largest = winners[0] if len(winners) == 1 else _largest_copy(winners)
-            if len(winners) > 1 and largest is not None:
-                self._guesses.append((name, largest))
-            if winners:
-                return largest
-        return None
+            if winners and largest is None:
+                break
+            if largest is not None:
+                return Claim(largest, agreeing, guessed=len(winners) > 1)
+        return self._by_another_suffix(wanted)
 
-    def _nearest(self, wanted: Sequence[str]) -> list[Path]:
-        """The files of a name that agree with it in most parts."""
+    def _nearest(self, wanted: Sequence[str]) -> tuple[int, list[Path]]:
+        """In how many parts files agree with a name at most, and those that do."""
         known = self._known(wanted[-1])
         ranked = [(_agreeing(found, wanted), -rank, path) for rank, found, path in known]
-        best = max((key for *key, _ in ranked), default=None)
-        return [path for *key, path in ranked if key == best]
+        best = max((key for *key, _ in ranked), default=[0, 0])
+        return best[0], [path for *key, path in ranked if key == best]
 
-    def _by_another_suffix(self, name: str, wanted: Sequence[str]) -> Path | None:
+    def _by_another_suffix(self, wanted: Sequence[str]) -> Claim | None:
         """The one image in the folder that is named whose suffix alone is another."""
         stem, suffix = os.path.splitext(wanted[-1])
         if self.suffixes != IMAGE_SUFFIXES or suffix not in self.suffixes:
@@ -165,13 +189,11 @@ class FileFinder:
             for _, parts, path in self._known(stem + other)
             if (parts[-2:-1] == tuple(wanted[-2:-1]) if wanted[:-1] else path.parent in self.roots)
         ]
-        if len(found) != 1:
-            return None
-        self._guesses.append((name, found[0]))
-        return found[0]
+        return Claim(found[0], 0, guessed=True) if len(found) == 1 else None
 
     def _known(self, name: str) -> Sequence[tuple[int, tuple[str, ...], Path]]:
-        return self._index.get(name, ())
+        # A link that leads nowhere has a name, too.
+        return [entry for entry in self._index.get(name, ()) if _is_file(os.fspath(entry[2]))]
 
     @cached_property
     def _index(self) -> dict[str, list[tuple[int, tuple[str, ...], Path]]]:
@@ -196,6 +218,9 @@ def _walk(root: Path, avoid: tuple[str, ...], seen: set[str]) -> Iterator[tuple[
             folders.clear()
             continue
         seen.add(real)
+        if folder != os.fspath(root) and is_ours(folder, files):
+            folders.clear()
+            continue
         folders[:] = sorted(name for name in folders if not name.lower().startswith(avoid))
         count += len(files)
         if count > FILES_LIMIT:

@@ -11,6 +11,7 @@ import numpy as np
 
 from deltas_geom.cameras.lenses.models import MODELS
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray, Lens
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
@@ -62,8 +63,9 @@ def read(path: Path) -> Capture:
     rigs = _rigs(folder / "rigs.txt")
     records = folder / "records_camera.txt"
     rows = list(_rows(records, 3))
-    ids = frame_ids([words[2] for _, words in rows], records)
-    finder = FileFinder(path, (folder / "records_data",))
+    names = [words[2] for _, words in rows]
+    ids = frame_ids(names, records)
+    finder = FileFinder(path, (folder / "records_data",), names=names)
     found = Collected(records)
     for id, (number, (stamp, device, name, *_)) in zip(ids, rows, strict=True):
         if device not in sensors:
@@ -83,7 +85,9 @@ def read(path: Path) -> Capture:
         pose = cam_from_world(matrix, id=id, path=folder / "trajectories.txt")
         sensor = sensors[device]
         found.add(photo, pose, sensor.K, stated=sensor.size, lens=sensor.lens)
-    capture = found.capture(path, "kapture", metric=False, doubts=finder.doubts())
+    capture = found.capture(
+        path, "kapture", metric=False, doubts=finder.doubts(), form=FileForm(centre=CORNER)
+    )
     return replace(capture, points=_points(path / "reconstruction" / "points3d.txt"))
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import in_words
@@ -70,7 +71,9 @@ def read(path: Path) -> Capture:
         f"intrinsics are taken to be of images {1 / scale:g} times as large, {folder}"
         for scale in sorted(rescaled)
     ]
-    capture = found.capture(path, "MVSNet", metric=False, doubts=doubts)
+    capture = found.capture(
+        path, "MVSNet", metric=False, doubts=doubts, form=FileForm(centre=CORNER)
+    )
     stated = [ranges[id] for id in capture.frames]
     known = [depths for depths in stated if depths is not None]
     return replace(

@@ -59,8 +59,9 @@ def read(path: Path) -> Capture:
     )
     folder = file.parent if path.is_file() else path
     views = list(_views(scene))
-    ids = frame_ids([view.name for view in views], file)
-    finder = FileFinder(folder, _image_folders(scene, folder, file))
+    names = [view.name for view in views]
+    ids = frame_ids(names, file)
+    finder = FileFinder(folder, _image_folders(scene, folder, file), names=names)
     cameras = _cameras(scene)
     poses = dict(_items(scene, "extrinsics"))
     found = Collected(file)

@@ -63,7 +63,7 @@ def read(path: Path) -> Capture:
     shots = best.inner("shots")
     names = sorted(shots.values)
     ids = dict(zip(names, frame_ids(names, file), strict=True))
-    finder = FileFinder(folder, (folder / "images", folder.parent / "images"))
+    finder = FileFinder(folder, (folder / "images", folder.parent / "images"), names=names)
     cameras = _cameras(best)
     found = Collected(file)
     for name, id in ids.items():

@@ -9,6 +9,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.readers.files import FileFinder
@@ -25,6 +26,7 @@ from deltas_nets.captures.readers.own_cameras import (
     OwnCamera,
     depth_camera,
     named_cameras,
+    pixel_centre,
     sized,
     stated_camera,
 )
@@ -65,13 +67,13 @@ def read(path: Path) -> Capture:
     files = [path] if path.is_file() else [path / name for name in NAMES]
     file = next(file for file in files if file.is_file())
     root = _root(file)
-    finder = FileFinder(file.parent, [file.parent / "images"])
-    entries = _entries(root, file, finder)
+    entries, finder = _entries(root, file)
     images: dict[OwnCamera, list[Path]] = {}
     for entry in entries:
         images.setdefault(entry.camera, []).extend([entry.image] if entry.image else [])
     cameras = sized(images, file)
-    depths = FileFinder(file.parent, suffixes=DEPTH_SUFFIXES, avoid=(".",))
+    names = [entry.fields.text("depth") for entry in entries if "depth" in entry.fields]
+    depths = FileFinder(file.parent, names=names, suffixes=DEPTH_SUFFIXES, avoid=(".",))
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     for entry in entries:
@@ -99,10 +101,11 @@ def read(path: Path) -> Capture:
         points=read_points(root, file.parent, ids, packed, scales),
         sources=_sources(used, list(packed), ids),
         depth_ranges=_depth_ranges(root, used),
+        form=FileForm(centre=pixel_centre(root)),
     )
 
 
-def _entries(root: Fields, file: Path, finder: FileFinder) -> list[_Entry]:
+def _entries(root: Fields, file: Path) -> tuple[list[_Entry], FileFinder]:
     fields = [
         Fields(values, file, where=f"frame {index}", remedy=REMEDY)
         for index, values in enumerate(root.items("frames"))
@@ -110,13 +113,14 @@ def _entries(root: Fields, file: Path, finder: FileFinder) -> list[_Entry]:
     for frame in fields:
         check_keys(frame, FRAME)
     cameras = named_cameras(root)
+    ids, names = _ids(fields, file), [frame.text("image") for frame in fields]
+    finder = FileFinder(file.parent, [file.parent / "images"], names=names)
     entries = []
-    for id, frame in zip(_ids(fields, file), fields, strict=True):
-        image = frame.text("image")
+    for id, frame, image in zip(ids, fields, names, strict=True):
         frame.where = f"{frame.where} ({image[:80]})"
         camera = stated_camera(root, frame, cameras)
         entries.append(_Entry(id, frame, finder.find(image), camera))
-    return entries
+    return entries, finder
 
 
 def _frame(entry: _Entry, camera: SizedCamera, root: Fields, depths: FileFinder) -> Frame | Lost:

@@ -16,7 +16,14 @@ from deltas_nets.captures.readers.own_table import CAMERA, DEPTH_CAMERA, check_k
 from deltas_nets.captures.readers.scannet import world_from_cam_inverse
 from deltas_nets.errors import UserError
 
-__all__ = ["OwnCamera", "depth_camera", "named_cameras", "sized", "stated_camera"]
+__all__ = [
+    "OwnCamera",
+    "depth_camera",
+    "named_cameras",
+    "pixel_centre",
+    "sized",
+    "stated_camera",
+]
 
 CENTRES = {"integers": 0.0, "halves": 0.5}
 """Where the centre of the first pixel is, in the file's words."""
@@ -70,10 +77,11 @@ def stated_camera(root: Fields, frame: Fields, named: Mapping[str, Fields]) -> O
                 + (f" (did you mean {near[0]}?)" if near else "")
             )
         layers.append(named[name])
-    return _camera(Fields.merged((*layers, frame), CAMERA), _offset(root))
+    return _camera(Fields.merged((*layers, frame), CAMERA), pixel_centre(root))
 
 
-def _offset(root: Fields) -> float:
+def pixel_centre(root: Fields) -> float:
+    """Where the centre of the first pixel is in the file."""
     centres = root.text("pixel_centres", "integers")
     if centres not in CENTRES:
         raise root.error(f"has pixel_centres {centres[:20]!r}, neither {' nor '.join(CENTRES)}")
@@ -131,7 +139,7 @@ def depth_camera(
         return None
     values = said.inner("depth_camera")
     check_keys(values, DEPTH_CAMERA)
-    camera = _camera(values, _offset(root))
+    camera = _camera(values, pixel_centre(root))
     if "cam_from_depth" not in values:
         return camera.K(), camera.size, None
     try:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
 from deltas_nets.captures.readers.collected import Collected
@@ -71,7 +72,7 @@ def read(path: Path) -> Capture:
             stated=stated,
             depth=depth if depth.is_file() else None,
         )
-    return found.capture(path, "Polycam", metric=True, doubts=doubts)
+    return found.capture(path, "Polycam", metric=True, doubts=doubts, form=FileForm(True, CORNER))
 
 
 def _keyframes(path: Path) -> tuple[Path, Path] | None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Lost
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
 from deltas_nets.captures.readers.collected import Collected
@@ -48,7 +49,9 @@ def read(path: Path) -> Capture:
     without = len(images.keys() - cameras.keys())
     if without:
         doubts.append(f"{without} of {len(images)} images have no pose and are left out, {path}")
-    return found.capture(path, "3D Scanner App", metric=True, doubts=doubts)
+    return found.capture(
+        path, "3D Scanner App", metric=True, doubts=doubts, form=FileForm(True, CORNER)
+    )
 
 
 def _K(fields: Fields) -> FloatArray:

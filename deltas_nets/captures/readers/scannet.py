@@ -210,10 +210,12 @@ def _find_scene(path: Path) -> Path:
 
 
 def _files_by_id(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Files named by a number, in the order of the numbers."""
+    """Files named by a number, in the order of the numbers; links that lead nowhere are none."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in suffixes or not _is_number(path.stem):
+            continue
+        if path.is_symlink() and not path.exists():
             continue
         id = int(path.stem)
         if id in found:

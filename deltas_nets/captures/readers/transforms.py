@@ -13,6 +13,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame, Lost
 from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.points import SparsePoints
@@ -72,11 +73,13 @@ def read(path: Path) -> Capture:
     """Read the file, or all parts of it; see `deltas_nets.captures.opening.Reader`."""
     folder = path.parent if path.is_file() else path
     files = [path] if path.is_file() else _files(path)
-    finder = FileFinder(folder, _image_folders(folder))
-    entries = [entry for file in files for entry in _entries(file, finder)]
-    ids = _ids([entry.name for entry in entries], files[0])
+    entries = [entry for file in files for entry in _entries(file)]
+    names = [entry.name for entry in entries]
+    ids = _ids(names, files[0])
+    finder = FileFinder(folder, _image_folders(folder), names=names)
+    entries = [entry._replace(image=finder.find(entry.name)) for entry in entries]
     cameras = _sized(entries)
-    depths = FileFinder(folder, suffixes=DEPTH_SUFFIXES, avoid=(".",))
+    depths = FileFinder(folder, names=_depth_names(entries), suffixes=DEPTH_SUFFIXES, avoid=(".",))
     clouds = FileFinder(folder, suffixes=(".ply",), avoid=(".",))
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
@@ -118,6 +121,7 @@ def read(path: Path) -> Capture:
         layout=files[0].name,
         metric=_metric(root, entries),
         points=points,
+        form=FileForm(opengl=True, centre=0.5),
     )
 
 
@@ -133,8 +137,8 @@ def _image_folders(folder: Path) -> list[Path]:
     return [folder / "images", *of_scannetpp]
 
 
-def _entries(file: Path, finder: FileFinder) -> list[_Entry]:
-    """All frames of a file; ScanNet++ lists those that are kept for tests apart."""
+def _entries(file: Path) -> list[_Entry]:
+    """All frames of a file, images not looked for; ScanNet++ lists those kept for tests apart."""
     root = Fields(
         read_json(file, name="transforms", remedy=REMEDY), file, where="it", remedy=REMEDY
     )
@@ -147,7 +151,7 @@ def _entries(file: Path, finder: FileFinder) -> list[_Entry]:
         if not name_parts(name):
             raise frame.error("has an empty file_path")
         frame.where = f"frame {index} ({name[:80]})"
-        entries.append(_Entry(frame, root, name, finder.find(name), stated_camera(root, frame)))
+        entries.append(_Entry(frame, root, name, None, stated_camera(root, frame)))
     return entries
 
 
@@ -211,10 +215,19 @@ def _pose(entry: _Entry) -> FloatArray | Lost:
         return Lost("not rigid", UserError(what, frame.path, error.remedy))
 
 
+def _depth_key(frame: Fields) -> str:
+    return next((key for key in reversed(DEPTHS) if key in frame), "depth_file_path")
+
+
+def _depth_names(entries: list[_Entry]) -> list[str]:
+    keyed = ((entry.frame, _depth_key(entry.frame)) for entry in entries)
+    return [frame.text(key) for frame, key in keyed if key in frame]
+
+
 def _depth(entry: _Entry, finder: FileFinder) -> tuple[Path | None, float]:
     """The depth of a frame, and its steps in a unit of the world."""
     frame, root = entry.frame, entry.root
-    key = next((key for key in reversed(DEPTHS) if key in frame), "depth_file_path")
+    key = _depth_key(frame)
     unit = DEPTHS[key]
     factor = root.number(unit, 1 / MILLIMETRES)
     if factor <= 0:
