@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from deltas_nets.commands.evaluate_flags import without_effect
 from deltas_nets.commands.flags import Flag, Prediction, usable_device
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
@@ -117,25 +118,18 @@ class Evaluate(Prediction):
         if self.protocol != "chosen" and self.view_sets is not None:
             what = "view sets come from a file or by a protocol"
             raise UserError(what, f"--protocol {self.protocol}", "leave out it or --view-sets")
-        if self.gap is not None and self.protocol != "paper":
-            raise UserError("no gap is kept", "--gap", "add --protocol paper")
         if self.predictions is not None and self.settings.given():
             what = "maps are there already, whatever the settings"
             raise UserError(what, "--predictions", "leave it out, or the settings")
-        there = None if self.predictions is None else "no --predictions, as their maps are there"
-        recorded = there and self.view_sets is None and self.protocol == "chosen"
-        refuse_unused(
-            self,
-            {
-                "split": "--data scannet" if self.data is None else None,
-                "conditions": "--rooms" if self.rooms is None else None,
-                "every": "--protocol paper" if self.protocol != "paper" else None,
-                "views": "--view-sets or --protocol" if recorded else None,
-                "weights": there,
-                "precision": there,
-                "work_size": there,
-            },
+        chosen = self.view_sets is None and self.protocol == "chosen"
+        wanted = without_effect(
+            scannet=self.data is not None,
+            rooms=self.rooms is not None,
+            paper=self.protocol == "paper",
+            maps=self.predictions is not None,
+            recorded_sets=self.predictions is not None and chosen,
         )
+        refuse_unused(self, wanted)
 
     def _of_scenes(self) -> tuple["DatasetScores", str]:
         from deltas_nets.evaluate.dataset import evaluate_scenes
