@@ -307,9 +307,9 @@ def test_it_exports_for_any_number_of_points() -> None:
         assert_close(found, wanted, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)], ids=str
-)
+# By day the exported network, which triangulates, stands for it (tests/nets/test_export.py).
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_onnxruntime_finds_the_same_points(dtype: torch.dtype, tmp_path: Path) -> None:
     pytest.importorskip("onnx", reason="needs the extra 'export'")
     pytest.importorskip("onnxscript", reason="needs the extra 'export'")

@@ -43,7 +43,7 @@ class Exported(NamedTuple):
         return found
 
 
-# Each takes most of a minute to export. The example of export_onnx compares 2 views every time.
+# Each takes most of a minute to export.
 @pytest.fixture(
     scope="module",
     params=[
