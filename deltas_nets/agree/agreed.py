@@ -11,12 +11,11 @@ from deltas_nets.agree.consensus import consensus
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.hidden import hidden
 from deltas_nets.agree.seen_from import seen_from
-from deltas_nets.network.correction import Correction, Places, correction
+from deltas_nets.network.correction import correction
 from deltas_nets.network.known_depth import KnownDepth, as_points
 
 EDGE = 0.1
 """Range of log depth within two pixels: there the map itself knows best where things end."""
-PIXELS = 1 << 12
 MOST = 200
 """Places that tell how far the rest of the map is off."""
 
@@ -51,7 +50,7 @@ def agreed(own: KnownDepth, anchor: PosedViews, others: Sequence[Heard]) -> Know
     process = correction(points, told.deviation[None].square(), log_depth[None], most=MOST)
     depth = torch.where(known, told.depth, own.depth).flatten()
     left = (there & ~known).flatten().nonzero()[:, 0]
-    depth[left] *= _correction_at(process, left, log_depth).exp()
+    depth[left] *= process.at(left[None], log_depth[None])[0].exp()
     deviation = torch.where(known, told.deviation, own.deviation)
     return KnownDepth(depth.view(own.depth.shape), deviation)
 
@@ -60,10 +59,3 @@ def _edges(log_depth: Tensor) -> Tensor:
     highest = F.max_pool2d(log_depth, 5, stride=1, padding=2)
     lowest = -F.max_pool2d(-log_depth, 5, stride=1, padding=2)
     return highest - lowest > EDGE
-
-
-def _correction_at(process: Correction, index: Tensor, log_depth: Tensor) -> Tensor:
-    """The correction ``(N,)`` at some pixels, not too many of them at a time."""
-    parts = torch.split(index, PIXELS)
-    found = [process(Places.at(part[None], log_depth[None]))[0] for part in parts]
-    return torch.cat(found) if found else log_depth.new_zeros(0)

@@ -42,7 +42,8 @@ def held(found: KnownDepth, measured: KnownDepth) -> KnownDepth:
     moved = log_depth
     if points.weight.count_nonzero() >= FEWEST:
         process = correction(points, said.deviation[None].square(), log_depth[None], most=MOST)
-        moved = log_depth + process.everywhere(log_depth[None])[0]
+        everywhere = torch.arange(log_depth.numel(), device=log_depth.device)[None]
+        moved = log_depth + process.at(everywhere, log_depth[None]).view(log_depth.shape)
     log_said = torch.where(known, said.depth, 1.0).log()
     off = log_said - moved
     own, theirs = found.deviation.square(), said.deviation.square()

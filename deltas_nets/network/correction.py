@@ -72,12 +72,10 @@ class Correction(NamedTuple):
         """``(B, M')`` what is to be added to log depth at other places."""
         return (covariance(places, self.places) @ self.shares[..., None])[..., 0]
 
-    def everywhere(self, log_depth: Tensor) -> Tensor:
-        """``(B, 1, H, W)`` the same at all pixels of a map, not too many of them at a time."""
-        batch, count = log_depth.shape[0], log_depth.shape[-2:].numel()
-        pixels = torch.arange(count, device=log_depth.device).expand(batch, count)
-        parts = [self(Places.at(some, log_depth)) for some in torch.split(pixels, PIXELS, dim=-1)]
-        return torch.cat(parts, dim=-1).view(log_depth.shape)
+    def at(self, index: Tensor, log_depth: Tensor) -> Tensor:
+        """``(B, M')`` the same at pixels ``(B, M')`` of a map, not too many of them at a time."""
+        parts = [self(Places.at(some, log_depth)) for some in torch.split(index, PIXELS, dim=-1)]
+        return torch.cat(parts, dim=-1)
 
     def variance(self, places: Places) -> Tensor:
         """``(B, M')`` how much stays open there."""
