@@ -132,7 +132,9 @@ def test_many_pixels_have_the_rays_that_few_have(name: str, dtype: torch.dtype) 
     assert_close(rays, torch.cat([part.rays for part in few]), rtol=0, atol=error)
 
 
-@pytest.mark.parametrize("name", ["OPENCV_FISHEYE", "barrel", "OPENCV"])
+@pytest.mark.parametrize(
+    "name", ["OPENCV_FISHEYE", "barrel", "OPENCV", "RAD_TAN_THIN_PRISM_FISHEYE"]
+)
 def test_many_pixels_have_the_derivatives_that_few_have(name: str) -> None:
     lens, pixels = ALL[name].lens(), pixels_of(MANY).reshape(2, -1, 2)
     weights = torch.linspace(-1, 1, 3).double()

@@ -1,4 +1,4 @@
-"""Rays of very many pixels of one lens that bends all pixels of a circle alike.
+"""Rays of very many pixels of one lens that bends all places of a circle alike.
 
 Such a ray depends on the distance from the centre alone, but for its turn around the axis. With b
 the tangent of half of its angle from the axis, divided by that distance, it is
@@ -7,7 +7,8 @@ the tangent of half of its angle from the axis, divided by that distance, it is
 
 of length 1 to rounding, in front of the lens and behind it; b is read from a table that the model's
 own rays make. Everything else is a few passes over numbers that stay in the cache, in NumPy, whose
-passes take half of torch's time. What the table does not hold is left to the model.
+passes take half of torch's time. What the table does not hold is left to the model. Where the plane
+itself is distorted, by a prism behind the lens, that is undone first.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deltas_geom.cameras.lenses.closed import Coefficients
+from deltas_geom.cameras.lenses.closed import Coefficients, Seen
 from deltas_geom.cameras.lenses.models import Model
 from deltas_geom.cameras.lenses.tables import Table, table_of
 from deltas_geom.numerics.chunks import alike
@@ -31,18 +32,20 @@ _CHUNK = 25600
 _SAMPLED = 512  # pixels, for how far the table goes
 _TOLERANCE = 1e-13
 _Rays = tuple[Tensor, Tensor]
+_Plane = Callable[[Array, Array, Array], Array | None]
+"""Writes where pixels ``(N, 2)`` are on the plane, ``(N,)`` twice; which are, None for all."""
 
 
 class RaysOfMany(NamedTuple):
     """A function of pixels.
 
     Attributes:
-        K: ``(3, 3)``.
-        table: of b by the squared radius in px along x.
+        plane: takes pixels to the plane.
+        table: of b by the squared radius on the plane.
         others: rays ``(N, 3)`` and whether ``(N,)`` of pixels ``(N, 2)`` by the model itself.
     """
 
-    K: Array
+    plane: _Plane
     table: Table
     others: Callable[[Tensor], _Rays]
 
@@ -54,10 +57,12 @@ class RaysOfMany(NamedTuple):
 
     def _some(self, buffers: "_Buffers", pixels: Tensor, rays: Tensor, valid: Tensor) -> None:
         u, v, s, b, place, work, whole = buffers.first(len(pixels))
-        to_plane(self.K, pixels.numpy(), u, v)
+        placed = self.plane(pixels.numpy(), u, v)
         np.multiply(u, u, out=s)
         np.multiply(v, v, out=work)
         np.add(s, work, out=s)
+        if placed is not None:
+            np.copyto(s, np.inf, where=~placed)
         self.table.read(s, place, whole, work, out=b)
         known = valid.numpy()
         # The largest of numbers and NaN is NaN, which is not below.
@@ -123,8 +128,8 @@ class _Buffers(NamedTuple):
         return self if count == len(self.u) else type(self)(*(each[:count] for each in self))
 
 
-def to_plane(K: Array, pixels: Array, u: Array, v: Array) -> None:
-    """Pixels ``(N, 2)`` on the plane of the lens, as far apart as along x, into ``u``, ``v``."""
+def _along_x(K: Array, pixels: Array, u: Array, v: Array) -> None:
+    """As :data:`_Plane`, in px along x, which saves two divisions."""
     (fx, skew, cx), (_, fy, cy), _ = K
     np.subtract(pixels[:, 0], cx, out=u)
     np.subtract(pixels[:, 1], cy, out=v)
@@ -134,16 +139,29 @@ def to_plane(K: Array, pixels: Array, u: Array, v: Array) -> None:
         np.multiply(v, fx / fy, out=v)
 
 
-def sampled_end(K: Array, pixels: Tensor) -> float:
+def _undistorted(
+    K: Array, undone: Callable[[Tensor, Tensor], Seen], pixels: Array, u: Array, v: Array
+) -> Array | None:
+    """As :data:`_Plane`, whose distortion is undone."""
+    _along_x(K, pixels, u, v)
+    np.divide(u, K[0, 0], out=u)
+    np.divide(v, K[0, 0], out=v)
+    x, y, found = undone(torch.from_numpy(u), torch.from_numpy(v))
+    np.copyto(u, x.numpy())
+    np.copyto(v, y.numpy())
+    return None if found.all() else found.numpy()
+
+
+def _sampled_end(plane: _Plane, pixels: Tensor) -> float:
     """A squared radius on the plane that few pixels exceed."""
     flat = pixels.detach().reshape(-1, 2)
     some = flat[:: max(1, len(flat) // _SAMPLED)].numpy()
     u, v = np.empty(len(some)), np.empty(len(some))
-    with np.errstate(all="ignore"):
-        to_plane(K, some, u, v)
-        squared = u * u + v * v
+    placed = plane(some, u, v)
+    squared = u * u + v * v
+    squared = squared if placed is None else squared[placed]
     # Sorting puts NaN last. One pixel far away must not make the table coarse for all others.
-    return 1.3 * float(np.sort(squared)[int(0.98 * (len(some) - 1))])
+    return 1.3 * float(np.sort(squared)[int(0.98 * (len(squared) - 1))]) if len(squared) else 0.0
 
 
 def rays_around_axis(
@@ -157,7 +175,7 @@ def rays_around_axis(
     """The function of pixels, if there is a table for most of them.
 
     Args:
-        model: whose rays turn with their pixels around the axis.
+        model: whose rays turn with their places around the axis.
         K: ``(3, 3)``, finite.
         coefficients: each ``(1,)``.
         reach: ``(R,)`` of the model.
@@ -165,16 +183,18 @@ def rays_around_axis(
         others: rays of pixels that the table does not hold.
     """
     plain = K.numpy()
-    focal = float(plain[0, 0])
+    unit = 1.0 if model.undone else float(plain[0, 0])
+    plane: _Plane = partial(_along_x, plain)
+    if model.undone is not None:
+        before = model.undone
+        plane = partial(_undistorted, plain, lambda u, v: before(coefficients, reach, u, v, False))
 
     def half_tangents(squared: Array) -> tuple[Array, Array]:
-        u = torch.from_numpy(np.sqrt(squared) / focal)
+        u = torch.from_numpy(np.sqrt(squared) / unit)
         x, _, z, known = model.rays(coefficients, reach, u, torch.zeros_like(u), False)
-        return (x / ((1 + z) * u * focal)).numpy(), known.numpy()
+        return (x / ((1 + z) * u * unit)).numpy(), known.numpy()
 
-    end = sampled_end(plain, pixels)
-    if not 0 < end < 1e24:
-        return None
     with np.errstate(all="ignore"):
-        table = table_of(half_tangents, end, _TOLERANCE)
-    return None if table is None else RaysOfMany(plain, table, others)
+        end = _sampled_end(plane, pixels)
+        table = table_of(half_tangents, end, _TOLERANCE) if 0 < end < 1e24 else None
+    return None if table is None else RaysOfMany(plane, table, others)

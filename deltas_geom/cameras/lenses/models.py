@@ -25,7 +25,8 @@ class Model(NamedTuple):
         rays: from coefficients, the reach, a place on the plane and whether a gradient is wanted:
             the unit ray, and whether.
         reach: from coefficients, how far the model is one to one, ``(*B, R)``.
-        around_axis: do rays turn with their pixels around the axis?
+        around_axis: do rays turn with their places around the axis?
+        undone: of the same as for rays, the place for them, where the plane is distorted itself.
     """
 
     coefficients: tuple[str, ...]
@@ -34,6 +35,7 @@ class Model(NamedTuple):
     rays: Callable[[Coefficients, Tensor, Tensor, Tensor, bool], Direction]
     reach: Callable[[Coefficients], Tensor] | None = None
     around_axis: bool = True
+    undone: Callable[[Coefficients, Tensor, Tensor, Tensor, bool], Seen] | None = None
 
 
 def _closed(
@@ -104,7 +106,7 @@ MODELS: dict[str, Model] = {
         prism_of_aria.pixels,
         prism_of_aria.rays,
         prism_of_aria.reach,
-        around_axis=False,
+        undone=prism_of_aria.undone,
     ),
     "EQUIRECTANGULAR": _closed("", 2, closed.panorama_pixels, closed.panorama_rays),
 }

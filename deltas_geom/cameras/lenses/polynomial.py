@@ -98,9 +98,13 @@ class _Aria(NamedTuple):
         self, coefficients: Coefficients, reach: Tensor, u: Tensor, v: Tensor, derivable: bool
     ) -> Direction:
         """As :attr:`Model.rays`."""
-        u, v, within = _plane(self.second.terms(coefficients), reach[..., 1:], u, v, derivable)
-        x, y, z, found = self.first.rays(coefficients, reach[..., :1], u, v, derivable)
-        return x, y, z, found & within
+        return self.first.rays(coefficients, reach[..., :1], u, v, derivable)
+
+    def undone(
+        self, coefficients: Coefficients, reach: Tensor, u: Tensor, v: Tensor, derivable: bool
+    ) -> Seen:
+        """As :attr:`Model.undone`."""
+        return _plane(self.second.terms(coefficients), reach[..., 1:], u, v, derivable)
 
 
 prism_of_aria = _Aria(

@@ -147,9 +147,13 @@ def _rays(
     small = None
     if not (surely_below(u, _LARGEST) and surely_below(v, _LARGEST)):
         small = torch.maximum(u.detach().abs(), v.detach().abs()) < _LARGEST
-    u, v = only(u, small), only(v, small)
-    *ray, valid = MODELS[model].rays(_terms(coefficients), reach, u, v, derivable)
-    valid = only(valid, small, finite if finite is None else finite.squeeze(-1), other=False)
+    u, v, within = only(u, small), only(v, small), None
+    terms, undone = _terms(coefficients), MODELS[model].undone
+    if undone is not None:
+        u, v, within = undone(terms, reach, u, v, derivable)
+    *ray, valid = MODELS[model].rays(terms, reach, u, v, derivable)
+    finite = finite if finite is None else finite.squeeze(-1)
+    valid = only(valid, within, small, finite, other=False)
     return _together(ray, valid, pixels.dtype), valid
 
 
