@@ -5,23 +5,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from deltas_nets.captures.ply_vertices import header_of, vertices_of
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.cloud import CloudPoints
 from deltas_nets.fuse.mesh import Mesh
 from deltas_nets.outputs.atomic_files import write_atomically
-from deltas_nets.outputs.products import FINE_ENOUGH
 
 __all__ = ["check_mesh_extra", "write_cloud_ply", "write_glb", "write_mesh_ply"]
 
 
 def write_cloud_ply(path: Path, cloud: CloudPoints) -> None:
     """Write points with normals and colours as binary PLY; see `write_mesh_ply`."""
-    header, vertices = _vertices(
-        {"xyz": cloud.points, "normal": cloud.normals, "rgb": cloud.colors}
-    )
-    content = _header(header, len(vertices)) + vertices.tobytes()
+    vertices = vertices_of(xyz=cloud.points, normal=cloud.normals, rgb=cloud.colors)
+    content = header_of(vertices.dtype, len(vertices)) + vertices.tobytes()
     write_atomically(path, lambda file: file.write(content))
 
 
@@ -30,13 +27,13 @@ def write_mesh_ply(path: Path, mesh: Mesh) -> None:
 
     Coordinates are float, or double where they are too large for it.
     """
-    header, vertices = _vertices({"xyz": mesh.vertices, "rgb": mesh.colors})
-    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
+    vertices = vertices_of(xyz=mesh.vertices, rgb=mesh.colors)
+    more = (f"element face {len(mesh.faces)}", "property list uchar int vertex_indices")
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
     faces["count"], faces["vertices"] = 3, mesh.faces
 
     def write(file: Any) -> None:
-        file.write(_header(header, len(vertices)))
+        file.write(header_of(vertices.dtype, len(vertices), *more))
         file.write(vertices.tobytes())
         file.write(faces.tobytes())
 
@@ -72,22 +69,3 @@ def write_glb(path: Path, mesh: Mesh) -> None:
     scene.add_geometry(local, node_name="mesh", transform=np.diag([1.0, -1.0, -1.0, 1.0]) @ moved)
     content = scene.export(file_type="glb")
     write_atomically(path, lambda file: file.write(content))
-
-
-def _vertices(fields: dict[str, ArrayLike]) -> tuple[list[str], NDArray[np.void]]:
-    """Lines of the header, and the records."""
-    xyz = np.asarray(fields["xyz"], dtype=np.float64)
-    wide = np.abs(xyz).max(initial=0) > FINE_ENOUGH
-    real, code = ("double", "<f8") if wide else ("float", "<f4")
-    kinds = {"xyz": (real, code, "xyz"), "normal": ("float", "<f4", ("nx", "ny", "nz"))}
-    kinds["rgb"] = ("uchar", "u1", ("red", "green", "blue"))
-    lines = [f"property {kinds[name][0]} {axis}" for name in fields for axis in kinds[name][2]]
-    vertices = np.empty(len(xyz), dtype=[(name, kinds[name][1], 3) for name in fields])
-    for name, values in fields.items():
-        vertices[name] = values
-    return lines, vertices
-
-
-def _header(lines: list[str], count: int) -> bytes:
-    first = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    return "\n".join([*first, *lines, "end_header", ""]).encode("ascii")

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.ply_vertices import header_of, vertices_of, vertices_type
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_atomically
 from deltas_nets.outputs.depth_formats import (
@@ -41,11 +42,6 @@ __all__ = [
     "write_depth_png",
     "write_points_ply",
 ]
-
-FINE_ENOUGH = 1000.0
-"""Metres from the origin up to which points are written in float32, whose steps are 0.06 mm there.
-Beyond, as of surveyed (UTM) coordinates, they are written in float64."""
-
 
 OWN_UNIT = "the capture's own unit"
 """Where the capture has no metres."""
@@ -205,10 +201,8 @@ def write_points_ply(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
         )
     finite = np.isfinite(xyz).all(axis=1)
     xyz, rgb = xyz[finite], rgb[finite]
-    real = "double" if np.abs(xyz).max(initial=0) > FINE_ENOUGH else "float"
-    vertices = np.empty(len(xyz), dtype=_vertex(real))
-    vertices["xyz"], vertices["rgb"] = xyz, rgb
-    content = _ply_header(real, len(vertices)) + vertices.tobytes()
+    vertices = vertices_of(xyz=xyz, rgb=rgb)
+    content = header_of(vertices.dtype, len(vertices)) + vertices.tobytes()
     write_atomically(path, lambda file: file.write(content))
 
 
@@ -218,19 +212,10 @@ def read_points_ply(
     """Points ``(N, 3)`` and colors ``(N, 3)`` of a file of `write_points_ply`."""
     header, end, body = path.read_bytes().partition(b"end_header\n")
     found = re.search(rb"element vertex (\d+)\nproperty (float|double) x", header)
-    real, count = (found[2].decode(), int(found[1])) if found else ("float", 0)
-    if header + end != _ply_header(real, count):
+    count, double = (int(found[1]), found[2] == b"double") if found else (0, False)
+    kind = vertices_type("xyz", "rgb", double=double)
+    whole = len(body) == count * kind.itemsize
+    if header + end != header_of(kind, count) or not whole:
         raise UserError("the file is not one of ours", path, "read it with a PLY library")
-    vertices = np.frombuffer(body, dtype=_vertex(real), count=count)
+    vertices = np.frombuffer(body, dtype=kind, count=count)
     return vertices["xyz"].copy(), vertices["rgb"].copy()
-
-
-def _vertex(real: str) -> np.dtype[np.void]:
-    return np.dtype([("xyz", {"float": "<f4", "double": "<f8"}[real], 3), ("rgb", "u1", 3)])
-
-
-def _ply_header(real: str, count: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {real} {axis}" for axis in "xyz"]
-    lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")

@@ -110,6 +110,17 @@ def test_surveyed_coordinates_keep_their_digits(tmp_path: Path) -> None:
     assert np.array_equal(read_points_ply(tmp_path / "p.ply")[0], near.astype(np.float32))
 
 
+@pytest.mark.parametrize("change", [lambda whole: whole[:-1], lambda whole: whole + b"0"])
+def test_points_that_are_cut_short_are_refused(
+    tmp_path: Path, change: Callable[[bytes], bytes]
+) -> None:
+    path = tmp_path / "p.ply"
+    write_points_ply(path, np.eye(3), np.zeros((3, 3), np.uint8))
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(UserError, match="not one of ours"):
+        read_points_ply(path)
+
+
 def test_a_product_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything that the folder does with its files follows from the table."""
 

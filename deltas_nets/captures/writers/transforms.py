@@ -7,6 +7,7 @@ import numpy as np
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.depth_files import MILLIMETRES
 from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.ply_vertices import header_of, vertices_of
 from deltas_nets.captures.points import SparsePoints
 from deltas_nets.captures.writers.files import (
     PutDepth,
@@ -111,10 +112,5 @@ def _lens(lens: Lens | None, path: Path) -> dict[str, object]:
 
 
 def _write_ply(points: SparsePoints, path: Path) -> None:
-    kind = [("xyz", "<f8", 3), ("rgb", "u1", 3)]
-    table = np.empty(len(points.xyz), kind)
-    table["xyz"], table["rgb"] = points.xyz, points.rgb
-    columns = [f"property double {axis}" for axis in "xyz"]
-    columns += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *columns]
-    path.write_bytes("\n".join([*head, "end_header", ""]).encode() + table.tobytes())
+    table = vertices_of(double=True, xyz=points.xyz, rgb=points.rgb)
+    path.write_bytes(header_of(table.dtype, len(table)) + table.tobytes())
