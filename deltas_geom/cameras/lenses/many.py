@@ -11,8 +11,9 @@ passes take half of torch's time. What the table does not hold is left to the mo
 itself is distorted, by a prism behind the lens, that is undone first.
 """
 
+import math
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,9 @@ MANY = 32768
 _CHUNK = 25600
 _SAMPLED = 512  # pixels, for how far the table goes
 _TOLERANCE = 1e-13
+_FARTHEST = 1e24
+_KEPT = 16
+"""Tables, of 64 kB each: whoever has many images of a lens asks for its rays again and again."""
 _Rays = tuple[Tensor, Tensor]
 _Plane = Callable[[Array, Array, Array], Array | None]
 """Writes where pixels ``(N, 2)`` are on the plane, ``(N,)`` twice; which are, None for all."""
@@ -153,7 +157,7 @@ def _undistorted(
 
 
 def _sampled_end(plane: _Plane, pixels: Tensor) -> float:
-    """A squared radius on the plane that few pixels exceed."""
+    """A squared radius on the plane that few pixels exceed, of few that there are."""
     flat = pixels.detach().reshape(-1, 2)
     some = flat[:: max(1, len(flat) // _SAMPLED)].numpy()
     u, v = np.empty(len(some)), np.empty(len(some))
@@ -161,7 +165,28 @@ def _sampled_end(plane: _Plane, pixels: Tensor) -> float:
     squared = u * u + v * v
     squared = squared if placed is None else squared[placed]
     # Sorting puts NaN last. One pixel far away must not make the table coarse for all others.
-    return 1.3 * float(np.sort(squared)[int(0.98 * (len(squared) - 1))]) if len(squared) else 0.0
+    most = 1.2 * float(np.sort(squared)[int(0.98 * (len(squared) - 1))]) if len(squared) else 0.0
+    if not 0 < most < _FARTHEST:
+        return 0.0
+    # Other pixels of the same lens are to ask for the same table.
+    return float(2.0 ** (math.ceil(4 * math.log2(most)) / 4))
+
+
+@lru_cache(maxsize=_KEPT)
+def _table(
+    model: Model, coefficients: tuple[float, ...], reach: tuple[float, ...], unit: float, end: float
+) -> Table | None:
+    """The table of b, by squared radii in units of which ``unit`` are one of the plane."""
+    terms = [torch.tensor([each], dtype=torch.float64) for each in coefficients]
+    within = torch.tensor(reach, dtype=torch.float64)
+
+    def half_tangents(squared: Array) -> tuple[Array, Array]:
+        u = torch.from_numpy(np.sqrt(squared) / unit)
+        x, _, z, known = model.rays(terms, within, u, torch.zeros_like(u), False)
+        return (x / ((1 + z) * u * unit)).numpy(), known.numpy()
+
+    with torch.no_grad():
+        return table_of(half_tangents, end, _TOLERANCE)
 
 
 def rays_around_axis(
@@ -188,13 +213,10 @@ def rays_around_axis(
     if model.undone is not None:
         before = model.undone
         plane = partial(_undistorted, plain, lambda u, v: before(coefficients, reach, u, v, False))
-
-    def half_tangents(squared: Array) -> tuple[Array, Array]:
-        u = torch.from_numpy(np.sqrt(squared) / unit)
-        x, _, z, known = model.rays(coefficients, reach, u, torch.zeros_like(u), False)
-        return (x / ((1 + z) * u * unit)).numpy(), known.numpy()
-
     with np.errstate(all="ignore"):
         end = _sampled_end(plane, pixels)
-        table = table_of(half_tangents, end, _TOLERANCE) if 0 < end < 1e24 else None
+        if not end:
+            return None
+        given = tuple(float(each) for each in coefficients), tuple(reach.tolist())
+        table = _table(model, *given, unit, end)
     return None if table is None else RaysOfMany(plane, table, others)
