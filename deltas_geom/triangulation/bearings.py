@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
 from deltas_geom.numerics.vectors import Vector3, dot, minus, scaled
-from deltas_geom.triangulation.observed import finite_cameras
+from deltas_geom.triangulation.observed import check_observed, finite_cameras
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
 from deltas_geom.triangulation.rig_frame import datum_of
 from deltas_geom.triangulation.solution import in_world, kept
@@ -58,26 +57,12 @@ class Bearings(NamedTuple):
             return (ahead | self.weights.unused).all(dim=-2)
 
 
-def check_bearings(
-    cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> torch.Size:
-    """The batch dims to which all broadcast; raise unless rays ``(*B, V, N, 3)`` fit cameras."""
-    batch = check_batch(
-        cam_from_world=(cam_from_world, "+V 4 4"),
-        rays=(rays, "V N 3"),
-        weights=(weights, "V N"),
-        mask=(mask, "V N"),
-    )
-    check_bool(mask=mask)
-    return batch
-
-
 def see_rays(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> Bearings:
     """Tell used rays ``(*B, V, N, 3)`` of cameras ``(*B, V, 4, 4)`` from others."""
     work = solver_dtype(rays)
-    batch = check_bearings(cam_from_world, rays, weights, mask)
+    batch = check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
     pose, broken = finite_cameras(cam_from_world[..., :3, :])  # whatever the last row
     x, y, z = (one.to(work, memory_format=torch.contiguous_format) for one in rays.unbind(dim=-1))
     with torch.no_grad():

@@ -15,11 +15,11 @@ from deltas_geom.numerics.vectors import Vector3, dot, either, scaled
 from deltas_geom.triangulation.bearings import (
     Bearings,
     across,
-    check_bearings,
     describe_rays,
     see_rays,
 )
 from deltas_geom.triangulation.judge import judge, ok
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
 
@@ -115,7 +115,8 @@ def _triangulate(
     covariance: bool,
     max_residual: float | None,
 ) -> Triangulation:
-    check_bearings(*inputs)
+    cam_from_world, rays, weights, mask = inputs
+    check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
 
     def moved(seen: Bearings, points: Vector3, valid: Tensor) -> Vector3:
         return _stepped(seen, points, valid) if stepped else points
@@ -132,7 +133,7 @@ def _triangulate(
         solve=solve,
         follow=lambda seen, _, valid: moved(seen, _midpoint(seen)[0], valid),
         describe=describe_rays,
-        dtype=inputs[1].dtype,
+        dtype=rays.dtype,
         covariance=covariance,
         max_residual=max_residual,
     )

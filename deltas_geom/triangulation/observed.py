@@ -11,11 +11,24 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.checks import check_batch, check_bool
+from deltas_geom.checks import check_batch
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
+
+_DIMS = {
+    "proj": "+V 3 4",
+    "cam_from_world": "+V 4 4",
+    "pixels": "V N 2",
+    "rays": "V N 3",
+    "points": "N 3",
+    "weights": "V N",
+    "mask": "V N",
+    "used": "V N",
+    "covariance": "N 3 3",
+    "pose_covariance": "V 6 6",
+}
 
 
 class Cameras(NamedTuple):
@@ -114,21 +127,12 @@ def farthest(work: torch.dtype) -> float:
     return float(torch.finfo(work).max ** 0.25)
 
 
-def check_observed(
-    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> torch.Size:
-    """The batch dims of pixels ``(*B, V, N, 2)`` seen by cameras ``(*B, V, 3, 4)``.
+def check_observed(**named: Tensor | None) -> torch.Size:
+    """The batch dims to which arguments of these names broadcast, None being left out.
 
-    Raise unless weights and mask ``(*B, V, N)`` fit both, and the mask is bool.
+    Raise as :func:`check_batch` unless each has the dims of its name, and all fit each other.
     """
-    batch = check_batch(
-        proj=(proj, "+V 3 4"),
-        pixels=(pixels, "V N 2"),
-        weights=(weights, "V N"),
-        mask=(mask, "V N"),
-    )
-    check_bool(mask=mask)
-    return batch
+    return check_batch(**{name: (tensor, _DIMS[name]) for name, tensor in named.items()})
 
 
 def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,10 +16,10 @@ from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.bearings import (
     Bearings,
     across,
-    check_bearings,
     describe_rays,
     see_rays,
 )
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame, rig_sums
@@ -71,7 +71,7 @@ def triangulate_rays(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    check_bearings(cam_from_world, rays, weights, mask)
+    check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
     return operation(
         Triangulation,
         (cam_from_world, rays, weights, mask),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
-from deltas_geom.checks import batch_shape, check_positive, check_shapes
+from deltas_geom.checks import check_positive
 from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
@@ -113,9 +113,7 @@ def refine_points(
         >>> refined.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    seen = check_observed(proj, pixels, weights, mask)
-    check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    batch_shape(seen, points.shape[:-2])
+    batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask, points=points)
     if loss not in ("squared", "huber", "cauchy"):
         raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy', got {loss!r}")
     if gradient not in ("unrolled", "implicit"):
@@ -125,7 +123,7 @@ def refine_points(
     check_positive(scale=scale)
 
     def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:
-        problem = _pose(partial(robust_loss, loss, scale), seen, *inputs)
+        problem = _pose(partial(robust_loss, loss, scale), batch, *inputs)
         return _outward(problem, *descend(problem, steps), dtype=points.dtype)
 
     unrolled, implicit = partial(refined, _descend), partial(refined, _descend_implicitly)

@@ -141,7 +141,7 @@ class Call:
         if frame not in FRAMES:
             check_settings(frame)
         proj = known.proj
-        self.batch = check_observed(proj, pixels, weights, mask)
+        self.batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask)
         self.tensors: tuple[Any, ...] = (proj, pixels, weights, mask)
         self.known, self.frame, self.dtype = known, frame, proj.dtype
         self.alike = weights is None and mask is None

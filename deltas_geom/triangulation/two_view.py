@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_batch, check_bool
+from deltas_geom.checks import check_batch
 from deltas_geom.epipolar.fundamental import cross_matrix
 from deltas_geom.numerics.arithmetic import only, without_autocast
 from deltas_geom.numerics.sums import product
@@ -106,7 +106,6 @@ def triangulate_two_view(
         (tensor([[0.2000, 0.0000, 2.0000]]), tensor([2.]))
     """
     check_batch(proj=(proj, "2 3 4"), pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
-    check_bool(mask=mask)
     return operation(
         TwoViewTriangulation,
         (proj, pixels, mask),
