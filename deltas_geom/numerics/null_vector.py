@@ -18,8 +18,8 @@ from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 from deltas_geom.numerics.ldl import (
-    Factors,
-    factor,
+    Pivots,
+    eliminate,
     multiply,
     rounding,
     shifted,
@@ -27,6 +27,7 @@ from deltas_geom.numerics.ldl import (
     start,
 )
 from deltas_geom.numerics.proof import proved_vector
+from deltas_geom.numerics.symmetric3 import solve3
 from deltas_geom.numerics.vectors import (
     Symmetric4,
     Vector4,
@@ -95,24 +96,23 @@ def _iterated(
 ) -> NullVector:
     noise = rounding(matrix)
     # Above the null space by the rounding of M, every pivot is positive.
-    factors = factor(shifted(matrix, -noise))
-    x = start(factors)
+    f = eliminate(shifted(matrix, -noise))
+    x = start(f)
     for _ in range(_INVERSE_ITERATIONS - 1):
-        x = solve_scaled(factors, x)
+        x = solve_scaled(f, x)
     x = unit(x)  # before it overflows: towards infinity each solve makes it longer
-    near = solve_scaled(factors, x)
+    near = solve_scaled(f, x)
     length = dot(near, near)
-    quotient = factors.pivots.d3 * dot(near, x) / length - noise
+    quotient = f.d3 * dot(near, x) / length - noise
     near, quotient = _nearer(matrix, scaled(near, length.rsqrt()), quotient, noise)
 
     # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
-    factors = factor(shifted(matrix, quotient + noise))
-    p = factors.pivots
-    simple = p.i0.sign() + p.i1.sign() + p.i2.sign() + p.d3.sign() == 2
-    vector = solve_scaled(factors, near)
+    f = eliminate(shifted(matrix, quotient + noise))
+    simple = f.i0.sign() + f.i1.sign() + f.i2.sign() + f.d3.sign() == 2
+    vector = solve_scaled(f, near)
     if product is not None:
         for _ in range(polish):
-            vector = _polished(factors, unit(vector), product)
+            vector = _polished(f, unit(vector), product)
     return NullVector(vector, simple)
 
 
@@ -136,13 +136,13 @@ def _nearer(
     """
     # Off the quotient itself, where a pivot of a simple matrix may vanish exactly.
     below = -0.4 * noise
-    factors = factor(shifted(matrix, quotient - below))
+    f = eliminate(shifted(matrix, quotient - below))
     same = 256 * torch.finfo(noise.dtype).eps
-    b = solve_scaled(factors, a)  # K b = d3 a with K = M - shift, and a^T K a = below
+    b = solve_scaled(f, a)  # K b = d3 a with K = M - shift, and a^T K a = below
     along, length = dot(a, b), dot(b, b)
     across = less(length, along, along)
     # K in the plane, times across: below * across, g * sqrt(across), -along * g.
-    g = less(factors.pivots.d3, below, along)
+    g = less(f.d3, below, along)
     half = 0.5 * torch.addcmul(below * across, along, g)
     step = half + torch.addcmul(half * half, g * g, across).clamp(min=0).sqrt()
     # Where both are one, or both quotients, within rounding, the iteration has converged.
@@ -151,17 +151,17 @@ def _nearer(
     of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
     of_b = torch.where(flat, one, -step)
     nearer = plus(scaled(a, of_a), of_b, b)
-    change = torch.where(flat, below - factors.pivots.d3 * along / length, step / across)
+    change = torch.where(flat, below - f.d3 * along / length, step / across)
     return nearer, quotient - change
 
 
-def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
+def _polished(f: Pivots, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
     """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
     image = product(x)
     mu = dot(x, image)
-    change = solve_scaled(factors, minus(image, mu, x))
+    change = solve_scaled(f, minus(image, mu, x))
     # What the solve amplifies is along x, and goes.
-    return minus(x, factors.pivots.d3.reciprocal(), minus(change, dot(x, change), x))
+    return minus(x, f.d3.reciprocal(), minus(change, dot(x, change), x))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
@@ -203,27 +203,7 @@ def solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) 
     a12 = less(less(m12, x1, q2), q1, x2)
     a22 = less(m22 - mu, 2 * x2, q2)
     reflect = beta * dot(u, g)
-    h0, h1, h2 = minus(g[:3], reflect, x[:3])
-
-    noise = rounding(matrix)
-    i0, definite0 = _reciprocal(a00, noise)
-    l10, l20 = a01 * i0, a02 * i0
-    i1, definite1 = _reciprocal(less(a11, l10, a01), noise)
-    t = less(a12, l20, a01)
-    l21 = t * i1
-    i2, definite2 = _reciprocal(less(less(a22, l20, a02), l21, t), noise)
-    definite = definite0 & definite1 & definite2
-    h1 = less(h1, l10, h0)
-    h2 = less(less(h2, l20, h0), l21, h1) * i2
-    h1 = less(h1 * i1, l21, h2)
-    h0 = less(less(h0 * i0, l10, h1), l20, h2)
-
-    reflect = beta * (x0 * h0 + x1 * h1 + x2 * h2)
-    solution = (*minus((h0, h1, h2), reflect, u[:3]), -reflect * u[3])
+    h, definite = solve3((a00, a01, a02, a11, a12, a22), minus(g[:3], reflect, x[:3]))
+    reflect = beta * dot(x[:3], h)
+    solution = (*minus(h, reflect, u[:3]), -reflect * u[3])
     return either(definite, solution, (0.0,) * 4)
-
-
-def _reciprocal(pivot: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """1 / pivot, and whether it is positive beyond rounding; elsewhere 1, with no gradient."""
-    positive = pivot > noise
-    return 1 / torch.where(positive, pivot, 1.0), positive
