@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
-from deltas_geom.numerics.vectors import Vector3, dot, minus, scaled
+from deltas_geom.numerics.vectors import Symmetric3, Vector3, dot, minus, scaled
 from deltas_geom.triangulation.observed import check_observed, finite_cameras
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
 from deltas_geom.triangulation.rig_frame import datum_of
@@ -106,11 +106,7 @@ def describe_rays(
         distance = dot(offset, offset)
         share = safe_divide(weights.squared.expand_as(along), distance, used)
         share = safe_divide(share, distance, used)
-        x, y, z = offset
-        xx, yy, zz = x * x, y * y, z * z
-        entries = (yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy)
-        information = [(share * entry).sum(dim=-2) for entry in entries]
-        inverse = inverse_information(information, used.sum(dim=-2) >= 2)
+        inverse = inverse_information(across_sums(share, offset), used.sum(dim=-2) >= 2)
         found["covariance"] = unscaled(inverse, weights.largest.squeeze(-2))
     return found
 
@@ -121,6 +117,21 @@ def angles_of(seen: Bearings, offset: Vector3, used: Tensor) -> tuple[Tensor, Te
     # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
     sine = safe_sqrt(torch.where(used, dot(beside, beside), 0.0))
     return along, torch.atan2(sine, torch.where(used, along, 1.0))
+
+
+def across_sums(weight: Tensor, vector: Vector3) -> Symmetric3:
+    """Sums over views of w (|v|^2 - v v^T), of w and v ``(*B, V, N)``: six ``(*B, N)``.
+
+    Between points and vectors of unit length that is the squared distance from their lines.
+    """
+    x, y, z = vector
+    a, b, c = scaled(vector, weight)
+    entries = (
+        torch.addcmul(b * y, c, z), -a * y, -a * z,
+        torch.addcmul(a * x, c, z), -b * z,
+        torch.addcmul(a * x, b, y),
+    )  # fmt: skip
+    return tuple(entry.sum(dim=-2) for entry in entries)
 
 
 def across(directions: Vector3, vector: Vector3) -> Vector3:
