@@ -53,7 +53,7 @@ def cameras_of(proj: Tensor) -> Cameras:
     Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
     """
     clean, broken = finite_cameras(proj)
-    inverse, _ = inverted(clean[..., :3])
+    inverse = _inverses(clean[..., :3])
     return Cameras(clean, broken, inverse, -(inverse * clean[..., 3:].mT).sum(dim=-1))
 
 
@@ -135,11 +135,8 @@ def check_observed(**named: Tensor | None) -> torch.Size:
     return check_batch(**{name: (tensor, _DIMS[name]) for name, tensor in named.items()})
 
 
-def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses ``(*B, 3, 3)``, 0 with zero gradient if singular within rounding; are they regular?
-
-    Regular is ``(*B, 1, 1)``.
-    """
+def _inverses(matrix: Tensor) -> Tensor:
+    """Of ``(*B, 3, 3)``; 0 with zero gradient if singular within rounding."""
     cofactors = torch.linalg.cross(matrix.roll(-1, dims=-2), matrix.roll(-2, dims=-2))
     determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(dim=-1)[..., None, None]
     with torch.no_grad():
@@ -148,7 +145,7 @@ def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
         # The square of the determinant, in the gradient, has to be representable.
         regular = (size > limits.tiny**0.4) & (size < limits.max**0.4)
         regular = regular & (size > 4 * limits.eps * product)
-    return safe_divide(cofactors.mT, determinant, regular), regular
+    return safe_divide(cofactors.mT, determinant, regular)
 
 
 def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:

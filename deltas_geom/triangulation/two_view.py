@@ -19,7 +19,7 @@ from deltas_geom.records import Record
 from deltas_geom.status import Status
 from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
-from deltas_geom.triangulation.observed import clean_pixels, finite_cameras, inverted
+from deltas_geom.triangulation.observed import Cameras, cameras_of, clean_pixels
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import reproject
 from deltas_geom.triangulation.results import beyond, within_residual, without
@@ -119,60 +119,44 @@ def triangulate_two_view(
     )
 
 
-class _Rig(NamedTuple):
-    """Two cameras.
-
-    Attributes:
-        fundamental: ``(*B, 3, 3)`` with x1^T F x2 = 0 and largest entry 1; 0 if there is none.
-        world_from_pixel: ``(*B, 2, 3, 3)`` directions of depth 1, from homogeneous pixels.
-        centers: ``(*B, 2, 3)``; equal if a camera is singular.
-    """
-
-    fundamental: Tensor
-    world_from_pixel: Tensor
-    centers: Tensor
-
-
-def _rig(proj: Tensor) -> _Rig:
-    """Source: Hartley and Zisserman, 2nd ed., sections 6.2.4 and 9.2.2."""
-    inverse, regular = inverted(proj[..., :3])
-    centers = -(inverse @ proj[..., 3:]).squeeze(-1) * regular[..., 0].all(dim=-2, keepdim=True)
-    baseline = cross_matrix(centers.diff(dim=-2).squeeze(-2))
-    fundamental = inverse[..., 0, :, :].mT @ baseline @ inverse[..., 1, :, :]
-    largest = fundamental.detach().abs().amax(dim=(-2, -1), keepdim=True)
-    exists = (largest > 0) & largest.isfinite()
-    return _Rig(safe_divide(fundamental, largest, exists), inverse, centers)
-
-
 class _Seen(NamedTuple):
     """The inputs in the solver's type, broadcast, with everything unusable replaced.
 
     Attributes:
-        rig: of the cameras, those that are not finite replaced by 0.
+        cameras: those that are not finite replaced by 0.
+        fundamental: ``(*B, 3, 3)`` with x1^T F x2 = 0 and largest entry 1; 0 if there is none.
         xy: ``(*B, 2, 2, N)`` px, 0 where unused or not finite.
         finite: ``(*B, N)`` bool: everything used is.
         enough: ``(*B, N)`` bool: both views are used.
-        proj: ``(*B, 2, 3, 4)`` those cameras.
         dtype: of the inputs.
     """
 
-    rig: _Rig
+    cameras: Cameras
+    fundamental: Tensor
     xy: Tensor
     finite: Tensor
     enough: Tensor
-    proj: Tensor
     dtype: torch.dtype
 
 
 def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
     x, y, sound = clean_pixels(pixels)
     used = torch.ones_like(x, dtype=torch.bool) if mask is None else mask
-    camera, broken = finite_cameras(proj)
-    finite = only((broken == 0).unsqueeze(-1), sound, other=False)
+    cameras = cameras_of(proj)
+    finite = only((cameras.broken == 0).unsqueeze(-1), sound, other=False)
     xy = torch.where((finite & used).unsqueeze(-2), torch.stack([x, y], dim=-2), 0.0)
     known, enough = (finite | ~used).all(dim=-2), used.all(dim=-2)
     dtype = torch.promote_types(proj.dtype, pixels.dtype)
-    return _Seen(_rig(camera), xy, known, enough, camera, dtype)
+    return _Seen(cameras, _fundamental(cameras), xy, known, enough, dtype)
+
+
+def _fundamental(cameras: Cameras) -> Tensor:
+    """Source: Hartley and Zisserman, 2nd ed., section 9.2.2."""
+    first, second = cameras.inverse.unbind(dim=-3)
+    baseline = cross_matrix(cameras.centers.diff(dim=-2).squeeze(-2))
+    fundamental = first.mT @ baseline @ second
+    largest = fundamental.detach().abs().amax(dim=(-2, -1), keepdim=True)
+    return safe_divide(fundamental, largest, (largest > 0) & largest.isfinite())
 
 
 class _Solved(NamedTuple):
@@ -201,23 +185,22 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     def safe(divisor: Tensor) -> Tensor:
         return torch.where(divisor > torch.finfo(divisor.dtype).tiny ** 0.4, divisor, 1.0)
 
-    rig = seen.rig
+    inverse, centers = seen.cameras.inverse, seen.cameras.centers
     xy = seen.xy if valid is None else torch.where(valid[..., None, None, :], seen.xy, 0.0)
-    shift = correction(rig.fundamental, xy, safe)
-    inverse = rig.world_from_pixel
+    shift = correction(seen.fundamental, xy, safe)
     ray = product(inverse[..., :2], xy - shift) + inverse[..., 2:]
     size = safe(ray.detach().abs().amax(dim=-2))
     ray = ray / size.unsqueeze(-2)
     # By components, which costs half of torch.linalg.cross and its gradient.
     first, second = (one.unbind(dim=-2) for one in ray.unbind(dim=-3))
-    baseline = rig.centers.diff(dim=-2).mT.unbind(dim=-2)
+    baseline = centers.diff(dim=-2).mT.unbind(dim=-2)
     across = _cross(first, second)
     passing = _cross(baseline, second), _cross(baseline, first)
     squared = dot(across, across)
     along = torch.stack([dot(one, across) for one in passing], dim=-2)
     along = along / safe(squared).unsqueeze(-2)
     # From both cameras, so that their order does not count.
-    points = (rig.centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
+    points = (centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
     with torch.no_grad():
         beside = torch.stack([safe_sqrt(dot(one, one)) for one in passing], dim=-2)
         length, cosine = safe_sqrt(squared), dot(first, second)
@@ -228,9 +211,10 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
 
 def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
     """Points, and their status ``(*B, N)`` int8."""
-    rig, eps, solved = seen.rig, torch.finfo(seen.dtype).eps, _solve(seen)
-    length = rig.centers.diff(dim=-2).norm(dim=-1)
-    size = rig.centers.norm(dim=-1).amax(dim=-1)[..., None]
+    centers, eps, solved = seen.cameras.centers, torch.finfo(seen.dtype).eps, _solve(seen)
+    exist = (seen.cameras.inverse != 0).any(dim=-1).any(dim=-1).all(dim=-1, keepdim=True)
+    length = centers.diff(dim=-2).norm(dim=-1) * exist
+    size = centers.norm(dim=-1).amax(dim=-1)[..., None]
     # Centres closer together than the rounding of where they are do not differ. On the baseline
     # both rays pass the other camera within rounding.
     farther = solved.beside.amax(dim=-2)
@@ -260,8 +244,8 @@ def _describe(seen: _Seen, solved: _Solved, valid: Tensor, covariance: bool) -> 
         "errors": safe_sqrt(squared),
     }
     if covariance:
-        again = reproject(seen.proj, points.unbind(dim=-2), both.expand_as(squared))
-        noise = covariance_of(seen.proj, again, torch.ones_like(squared))
+        again = reproject(seen.cameras.proj, points.unbind(dim=-2), both.expand_as(squared))
+        noise = covariance_of(seen.cameras.proj, again, torch.ones_like(squared))
         found["covariance"] = unpacked3(noise)
     return found
 
