@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.checks import check_batch
-from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
+from deltas_geom.numerics.arithmetic import only, solver_dtype, unless_all, values_at_hand
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
@@ -62,9 +62,8 @@ def finite_cameras(proj: Tensor) -> tuple[Tensor, Tensor]:
     work = solver_dtype(proj)
     clean = proj.to(work)
     finite = clean.detach().abs().amax(dim=(-2, -1)) < farthest(work)  # NaN is not below
-    if not surely_all(finite):
-        # Double where: what is not used must pass no gradient and no NaN.
-        clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
+    # Double where: what is not used must pass no gradient and no NaN.
+    clean = only(clean, unless_all(finite[..., None, None]))
     return clean, (~finite).to(work)
 
 
@@ -154,15 +153,17 @@ def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor
     Three ``(*B, V, N)``.
     """
     if torch.compiler.is_compiling():
-        a, b, c = (_linear(row, places) for row in proj.unbind(dim=-2))
+        # Row by row, which a compiler fuses with what stands around it.
+        a, b, c = (in_views(row, *places) for row in proj.unbind(dim=-2))
         return a, b, c
     rows = proj.transpose(-3, -2).flatten(-3, -2)  # all of p1, all of p2, all of p3
     a, b, c = product(rows, torch.stack(tuple(places), dim=-2)).chunk(3, dim=-2)
     return a, b, c
 
 
-def _linear(row: Tensor, values: Sequence[Tensor]) -> Tensor:
-    """Row by row, which a compiler fuses with what stands around it."""
-    factors = row.unsqueeze(-1).unbind(dim=-2)
-    parts = [f * value.unsqueeze(-2) for f, value in zip(factors, values, strict=True)]
-    return sum(parts[1:], parts[0])
+def in_views(row: Tensor, x: Tensor, y: Tensor, z: Tensor, w: Tensor | None = None) -> Tensor:
+    """A row ``(*B, V, 4)`` of each camera times points, each ``(*B, N)``: ``(*B, V, N)``."""
+    total = row[..., 3:] if w is None else row[..., 3:] * w.unsqueeze(-2)
+    for axis, component in enumerate((x, y, z)):
+        total = torch.addcmul(total, row[..., axis, None], component.unsqueeze(-2))
+    return total

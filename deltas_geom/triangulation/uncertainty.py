@@ -17,7 +17,13 @@ from deltas_geom.triangulation.observed import (
     clean_points,
     finite_cameras,
 )
-from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.reprojection import (
+    Reprojection,
+    mean_of,
+    parallax_of,
+    reproject,
+    squared_errors,
+)
 from deltas_geom.triangulation.weights import weigh
 
 
@@ -48,12 +54,11 @@ def reprojection_residual(
     (cameras, broken), (places, known) = finite_cameras(proj), clean_points(points)
     x, y, sound = clean_pixels(pixels)
     healthy = (broken == 0).unsqueeze(-1)
-    sound = (
-        healthy.expand(*healthy.shape[:-1], points.shape[-2]) if sound is None else sound & healthy
-    )
+    sound = healthy if sound is None else sound & healthy
     weighed = weigh(weights, mask, batch=batch, like=weights.unsqueeze(-1), sound=sound)
     used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
-    residual = residual_of(reproject(cameras, places, used), x, y, weighed.squared)
+    found = reproject(cameras, places, used)
+    residual = mean_of(squared_errors(found, x, y), found.seen, weighed.squared)
     return residual.clamp(max=torch.finfo(proj.dtype).max).to(proj.dtype)
 
 
