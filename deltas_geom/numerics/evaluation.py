@@ -114,42 +114,47 @@ def _in_batch(tensor: Tensor | None) -> bool:
     return tensor is not None and torch._C._functorch.is_legacy_batchedtensor(tensor)
 
 
-class _Recomputed(torch.autograd.Function):
+class _Keeping(torch.autograd.Function):
+    """What keeps the inputs alone."""
+
     @staticmethod
     def forward(
         ctx: Any, function: Function, values: Function, cut: Cut | None, *tensors: Tensor | None
     ) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        ctx.cut = cut
-        return _kept(ctx, function, partial(in_chunks, values, cut), tensors)
+        if not torch.compiler.is_compiling():
+            ctx.set_materialize_grads(False)
+        ctx.function, ctx.cut = function, cut
+        ctx.save_for_backward(*tensors)
+        outputs = in_chunks(values, cut, *tensors)
+        first_only = isinstance(function, WithAdjoint)
+        ctx.floating = [out.is_floating_point() for out in outputs]
+        ctx.mark_non_differentiable(
+            *(out for k, out in enumerate(outputs) if (first_only and k) or not ctx.floating[k])
+        )
+        return outputs
 
+
+class _Recomputed(_Keeping):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        needed, function, cut, tensors = (
-            ctx.needs_input_grad[3:],
-            ctx.function,
-            ctx.cut,
-            ctx.saved_tensors,
-        )
-        nothing = (None,) * (3 + len(tensors))
+        needed, function, cut = ctx.needs_input_grad[3:], ctx.function, ctx.cut
+        tensors, settings = ctx.saved_tensors, (None, None, None)
         if all(gradient is None for gradient in gradients):
-            return nothing
+            return *settings, *(None for _ in tensors)
         if torch.is_grad_enabled():  # a second derivative is wanted of what is done here
-            return (
-                *nothing[:3],
-                *_pulled(function, gradients, needed, *tensors, create_graph=True),
-            )
+            pulled = _pulled(function, gradients, needed, *tensors, create_graph=True)
+            return *settings, *pulled
         # A sum of gradients in a batch could not tell one from the other.
         pull: Callable[..., Inputs] = partial(_pulled, function)
         if isinstance(function, WithAdjoint) and not any(map(_in_batch, gradients)):
             pull = function.adjoint
         if cut is None:
-            return (*nothing[:3], *pull(gradients, needed, *tensors))
+            return *settings, *pull(gradients, needed, *tensors)
         pairs = zip(
             chunks(cut, gradients, cut.outputs), chunks(cut, tensors, cut.inputs), strict=True
         )
         parts = zip(*(pull(some, needed, *inputs) for some, inputs in pairs), strict=True)
-        return (*nothing[:3], *map(_together, parts, cut.inputs))
+        return *settings, *map(_together, parts, cut.inputs)
 
 
 def _together(parts: tuple[Tensor | None, ...], dim: int) -> Tensor | None:
@@ -193,15 +198,7 @@ def _pulled(
     return tuple(next(pulled) if asked else None for asked in needed)
 
 
-class _Traced(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, function: Function, values: Function, cut: Cut | None, *tensors: Tensor | None
-    ) -> tuple[Tensor, ...]:
-        outputs = _kept(ctx, function, values, tensors)
-        ctx.floating = tuple(out.is_floating_point() for out in outputs)
-        return outputs
-
+class _Traced(_Keeping):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         needed, function, tensors = ctx.needs_input_grad[3:], ctx.function, ctx.saved_tensors
@@ -222,17 +219,3 @@ class _Traced(torch.autograd.Function):
         _, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
         pulled = dict(zip(places, pull(followed), strict=True))
         return (None, None, None, *(pulled.get(k) for k in range(len(tensors))))
-
-
-def _kept(
-    ctx: Any, function: Function, values: Function, tensors: tuple[Tensor | None, ...]
-) -> tuple[Tensor, ...]:
-    """The values, after ``ctx`` was told what to keep for backward."""
-    ctx.function = function
-    ctx.save_for_backward(*tensors)
-    outputs = values(*tensors)
-    first_only = isinstance(function, WithAdjoint)
-    ctx.mark_non_differentiable(
-        *(out for k, out in enumerate(outputs) if (first_only and k) or not out.is_floating_point())
-    )
-    return outputs
