@@ -17,7 +17,6 @@ from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3, dot
 from deltas_geom.records import Record
 from deltas_geom.status import Status
-from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
 from deltas_geom.triangulation.observed import Cameras, cameras_of, clean_pixels
 from deltas_geom.triangulation.operation import operation
@@ -181,15 +180,11 @@ class _Solved(NamedTuple):
 
 def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     """Points of pixels. What is not ``valid``, if given, passes no gradient and no NaN."""
-
-    def safe(divisor: Tensor) -> Tensor:
-        return torch.where(divisor > torch.finfo(divisor.dtype).tiny ** 0.4, divisor, 1.0)
-
     inverse, centers = seen.cameras.inverse, seen.cameras.centers
     xy = seen.xy if valid is None else torch.where(valid[..., None, None, :], seen.xy, 0.0)
-    shift = correction(seen.fundamental, xy, safe)
+    shift = _correction(seen.fundamental, xy)
     ray = product(inverse[..., :2], xy - shift) + inverse[..., 2:]
-    size = safe(ray.detach().abs().amax(dim=-2))
+    size = _safe(ray.detach().abs().amax(dim=-2))
     ray = ray / size.unsqueeze(-2)
     # By components, which costs half of torch.linalg.cross and its gradient.
     first, second = (one.unbind(dim=-2) for one in ray.unbind(dim=-3))
@@ -198,15 +193,57 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     passing = _cross(baseline, second), _cross(baseline, first)
     squared = dot(across, across)
     along = torch.stack([dot(one, across) for one in passing], dim=-2)
-    along = along / safe(squared).unsqueeze(-2)
+    along = along / _safe(squared).unsqueeze(-2)
     # From both cameras, so that their order does not count.
     points = (centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
     with torch.no_grad():
         beside = torch.stack([safe_sqrt(dot(one, one)) for one in passing], dim=-2)
         length, cosine = safe_sqrt(squared), dot(first, second)
-        sine = length * safe(squared + cosine * cosine).rsqrt()
+        sine = length * _safe(squared + cosine * cosine).rsqrt()
         parallax = torch.atan2(length, cosine)
     return _Solved(points, shift, along / size, parallax, sine, beside)
+
+
+def _correction(fundamental: Tensor, xy: Tensor) -> Tensor:
+    """What to take from pixels ``(*B, 2, 2, N)`` so that the rays of each pair meet, px."""
+    x1, x2 = xy.unbind(dim=-3)
+    # Normals of the epipolar lines, and the epipolar error.
+    a1, b1, last = (product(fundamental[..., :2], x2) + fundamental[..., 2:]).unbind(dim=-2)
+    back = fundamental[..., :2].mT
+    a2, b2 = (product(back[..., :2], x1) + back[..., 2:]).unbind(dim=-2)
+    error = a1 * x1[..., 0, :] + b1 * x1[..., 1, :] + last
+    # In units of the longer normal all that follows is in pixels, near the epipoles too.
+    share = 1 / _safe(torch.stack([a1, b1, a2, b2]).detach().abs().amax(dim=0))
+    a1, b1, a2, b2, error = (value * share for value in (a1, b1, a2, b2, error))
+    f00, f01, f10, f11 = (fundamental[..., i, j, None] * share for i in (0, 1) for j in (0, 1))
+
+    # The pair that moves by k times its normals meets where error - 2 half k + curve k^2 = 0.
+    da1, db1 = f00 * a2 + f01 * b2, f10 * a2 + f11 * b2
+    da2, db2 = f00 * a1 + f10 * b1, f01 * a1 + f11 * b1
+    curve = a1 * da1 + b1 * db1
+    squared1, squared2 = a1 * a1 + b1 * b1, a2 * a2 + b2 * b2
+    half = (squared1 + squared2) / 2
+    under = half * half - curve * error
+    real = under > 0
+    root = safe_sqrt(torch.where(real, under, 1.0))
+    # Gross errors near the epipoles have no such pair: there one pixel moves to the other's line.
+    k = error / _safe(torch.where(real, half + root, torch.maximum(squared1, squared2)))
+    k1 = torch.where(real | (squared1 >= squared2), k, 0.0)
+    k2 = torch.where(real | (squared1 < squared2), k, 0.0)
+
+    # The lines through that pair correspond: the given pixels' nearest on them meet exactly.
+    def moved(k: Tensor, a: Tensor, b: Tensor, new_a: Tensor, new_b: Tensor) -> Tensor:
+        share = k * (a * new_a + b * new_b) / _safe(new_a * new_a + new_b * new_b)
+        return torch.stack([share * new_a, share * new_b], dim=-2)
+
+    first = moved(k1, a1, b1, a1 - k2 * da1, b1 - k2 * db1)
+    second = moved(k2, a2, b2, a2 - k1 * da2, b2 - k1 * db2)
+    return torch.stack([first, second], dim=-3)
+
+
+def _safe(divisor: Tensor) -> Tensor:
+    """1 in place of what is not positive, nor its square."""
+    return torch.where(divisor > torch.finfo(divisor.dtype).tiny ** 0.4, divisor, 1.0)
 
 
 def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
