@@ -134,8 +134,10 @@ def through_frame(
         Five: of 1, of the squared distance of a camera from the datum and of its coordinates.
     """
     o0, o1, o2 = origin
-    square = share * x[3] * y[3] / unit
-    a, b, c = (-share * (y[3] * x[k] + x[3] * y[k]) - 2 * square * origin[k] for k in range(3))
+    of_x, of_y = share * y[3], share * x[3]
+    square = of_x * x[3] / unit
+    twice = 2 * square
+    a, b, c = (-(of_x * x[k] + of_y * y[k] + twice * origin[k]) for k in range(3))
     constant = -square * (o0 * o0 + o1 * o1 + o2 * o2 + unit * unit) - (a * o0 + b * o1 + c * o2)
     return constant, square, a, b, c
 

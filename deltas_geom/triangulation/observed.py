@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.checks import check_batch
-from deltas_geom.numerics.arithmetic import only, solver_dtype, unless_all, values_at_hand
+from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
@@ -62,8 +62,9 @@ def finite_cameras(proj: Tensor) -> tuple[Tensor, Tensor]:
     work = solver_dtype(proj)
     clean = proj.to(work)
     finite = clean.detach().abs().amax(dim=(-2, -1)) < farthest(work)  # NaN is not below
-    # Double where: what is not used must pass no gradient and no NaN.
-    clean = only(clean, unless_all(finite[..., None, None]))
+    if not surely_all(finite):
+        # Double where: what is not used must pass no gradient and no NaN.
+        clean = torch.where(finite[..., None, None], clean, 0.0)
     return clean, (~finite).to(work)
 
 

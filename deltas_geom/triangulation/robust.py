@@ -235,7 +235,8 @@ def _distances(observed: _Observations, points: Tensor) -> tuple[Tensor, Tensor]
     Infinite behind a view, and of what is too far to exist.
     """
     exist = (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(dim=-3)
-    points = only(points, unless_all(exist.unsqueeze(-3)))
+    if not surely_all(exist):
+        points = torch.where(exist.unsqueeze(-3), points, 0.0)
     views, shape = observed.usable.shape[-2], points.shape[-2:]
     rows = observed.proj.flatten(-3, -2)  # (*B, 3 V, 4): one product for all
     seen = product(rows[..., :3], points.flatten(-2)) + rows[..., 3:]

@@ -32,7 +32,9 @@ def gradients(
         by_pixel = deep[..., None] * error + depth[..., None] * pushed
         by_pixel = -squared[..., None] * by_pixel
         total = np.maximum(squared.sum(axis=-1), 1.0)
-        place, y, origin = (list(np.moveaxis(v, -1, 0)) for v in (x, push, solved.origin))
+        place, y, origin = (
+            [v[..., k] for k in range(v.shape[-1])] for v in (x, push, solved.origin)
+        )
         by_frame = mu * (not fixed) / (solved.unit * total)
         constant, square, *linear = through_frame(place, y, origin, solved.unit, by_frame)
         bent = np.stack([square, *linear], axis=-1)
