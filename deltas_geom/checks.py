@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 _NUMBERS = {str(number): number for number in range(1000)}
+_MASKS = ("mask", "used")
 _CURES = {"ndarray": "torch.from_numpy({0})", "PosedViews": "{0}.proj, or a field of it"}
 
 
@@ -19,15 +20,15 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     A dim is a number, which must match, or a letter, which must have one size in all
     tensors of the call; after "+" it must not be 0. Leading batch dims are free.
 
-    Numbers are real: integers, to which results would be rounded without a word, are refused. Not
-    so what is named ``mask``, ``used`` or ``..._index``: :func:`check_bool`, :func:`check_index`.
+    What is named ``mask`` or ``used`` is bool, ``..._index`` holds integers, and all else real
+    numbers: integers, to which results would be rounded without a word, are refused.
 
     Args:
         **named: ``name=(tensor, "+V 3 4")``.
 
     Raises:
         ShapeError: a trailing shape differs, or two tensors disagree on a letter.
-        TypeError: not a tensor, or not of real numbers.
+        TypeError: not a tensor, or one that holds something else.
 
     Example:
         >>> import torch
@@ -38,10 +39,16 @@ def check_shapes(**named: tuple[Tensor, str]) -> None:
     """
     sizes: dict[str, int] = {}
     for name, (tensor, spec) in named.items():
-        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+        if not isinstance(tensor, Tensor):
             check_tensor(**{name: tensor})
-            if name not in ("mask", "used") and not name.endswith("_index"):
-                check_floating(**{name: tensor})
+        if name in _MASKS:
+            check_bool(**{name: tensor})
+        elif name.endswith("_index"):
+            if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:
+                raise TypeError(f"{name} must hold integers, got {tensor.dtype}")
+        elif not tensor.is_floating_point():
+            cure = f"use {name}.float()"
+            raise TypeError(f"{name} must be floating point, got {tensor.dtype}: {cure}")
         dims = spec.replace("+", "").split()
         tail = tensor.shape[-len(dims) :]
         fits = len(tail) == len(dims)
@@ -94,22 +101,6 @@ def check_bool(**named: Tensor | None) -> None:
     for name, mask in named.items():
         if mask is not None and mask.dtype != torch.bool:
             raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}")
-
-
-def check_floating(**named: Tensor) -> None:
-    """Raise ``TypeError`` unless every tensor is of real floating point numbers."""
-    for name, tensor in named.items():
-        if not tensor.is_floating_point():
-            raise TypeError(
-                f"{name} must be floating point, got {tensor.dtype}: use {name}.float()"
-            )
-
-
-def check_index(**named: Tensor) -> None:
-    """Raise ``TypeError`` unless every tensor holds integers."""
-    for name, index in named.items():
-        if index.is_floating_point() or index.is_complex() or index.dtype == torch.bool:
-            raise TypeError(f"{name} must hold integers, got {index.dtype}")
 
 
 def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:

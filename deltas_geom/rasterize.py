@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.checks import check_batch, check_bool, check_image_size
+from deltas_geom.checks import check_batch, check_image_size
 from deltas_geom.numerics.arithmetic import finite_or_zero, only, promoted, without_autocast
 from deltas_geom.records import Record
 
@@ -68,7 +68,6 @@ def rasterize_depth(
     batch = check_batch(
         pixels=(pixels, "N 2"), depth=(depth, "N"), mask=(mask, "N"), weights=(weights, "N")
     )
-    check_bool(mask=mask)
     given = torch.ones_like(depth) if weights is None else weights
     pixels, depth, given = promoted(pixels, depth, given)
     # Double where: what is not used must pass no gradient and no NaN.

@@ -7,10 +7,11 @@ or cropped image, or a place in a feature map is here and nowhere else.
 from functools import lru_cache
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from deltas_geom.checks import check_image_size, check_shapes
-from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
+from deltas_geom.checks import batch_shape, check_image_size, check_shapes
+from deltas_geom.numerics.arithmetic import numbers_or_zero, values_at_hand, without_autocast
 
 
 def pixel_grid(
@@ -67,6 +68,23 @@ def normalize_pixels(pixels: Tensor, *, image_size: tuple[int, int]) -> Tensor:
     at_zero, slope = normalizing(image_size, like=pixels)
     grid = torch.addcmul(at_zero, pixels, slope)
     return grid.nan_to_num_(nan=-1.0, posinf=1.0, neginf=-1.0)
+
+
+def read_map(
+    maps: Tensor, pixels: Tensor, *, image_size: tuple[int, int], mode: str = "bilinear"
+) -> Tensor:
+    """``(*B, D, N)`` of maps ``(*B, D, h, w)`` of any stride at pixels ``(*B, N, 2)``.
+
+    Beyond the outer centres the border is continued. A number that is not finite counts as 0.
+    """
+    batch = batch_shape(maps.shape[:-3], pixels.shape[:-2])
+    # The count, not -1: a reshape of nothing cannot infer it.
+    count, size, num = batch.numel(), maps.shape[-3:], pixels.shape[-2]
+    maps = numbers_or_zero(maps).expand(*batch, *size).reshape(count, *size)
+    grid = normalize_pixels(pixels, image_size=image_size).to(maps.dtype)
+    grid = grid.expand(*batch, num, 2).reshape(count, 1, num, 2)
+    read = F.grid_sample(maps, grid, mode, padding_mode="border", align_corners=False)
+    return read.reshape(*batch, size[0], num)
 
 
 def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import ShapeError, check_batch, check_bool, check_kind, check_positive
+from deltas_geom.checks import ShapeError, check_batch, check_kind, check_positive
 from deltas_geom.diagnosis.causes import Cause
 from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
 from deltas_geom.diagnosis.hypotheses import Hypothesis, pixels_at, resized, shifted
@@ -99,7 +99,6 @@ def _checked(views: PosedViews, pixels: Tensor, mask: Tensor | None, threshold: 
     seen = {"pixels": (pixels, "V N 2"), "mask": (mask, "V N")}
     if views.check_shapes() or check_batch(K=(views.K, "V 3 3"), **seen):
         raise ShapeError("diagnose takes one set of views: no batch dims")
-    check_bool(mask=mask)
     if views.num_views < 2:
         raise ShapeError(f"diagnose needs 2 views or more, got {views.num_views}")
     check_positive(threshold=threshold)

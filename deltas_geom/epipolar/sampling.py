@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.cameras.pixels import in_image, normalize_pixels
+from deltas_geom.cameras.pixels import in_image, read_map
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_batch, check_image_size, check_shapes
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
@@ -16,7 +15,6 @@ from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     both,
     finite_or_zero,
-    numbers_or_zero,
     only,
     promoted,
     unless_all,
@@ -182,12 +180,5 @@ def sample_map(feature_map: Tensor, pixels: Tensor, *, image_size: tuple[int, in
         >>> sample_map(ramp, torch.tensor([[1.5, 0.0]]), image_size=(1, 4))
         tensor([[1.5000]])
     """
-    batch = check_batch(feature_map=(feature_map, "D +h +w"), pixels=(pixels, "N 2"))
-    # The count, not -1: a reshape of no keypoints cannot infer it.
-    count, size, num = batch.numel(), feature_map.shape[-3:], pixels.shape[-2]
-    maps, pixels = promoted(feature_map, pixels)
-    maps = numbers_or_zero(maps).expand(*batch, *size).reshape(count, *size)
-    grid = normalize_pixels(pixels, image_size=image_size)
-    grid = grid.expand(*batch, num, 2).reshape(count, 1, num, 2)
-    read = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
-    return read.squeeze(-2).mT.reshape(*batch, num, size[0])
+    check_batch(feature_map=(feature_map, "D +h +w"), pixels=(pixels, "N 2"))
+    return read_map(*promoted(feature_map, pixels), image_size=image_size).mT

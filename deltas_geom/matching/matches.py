@@ -92,7 +92,6 @@ def soft_argmax(
         tensor([2.])
     """
     batch = check_batch(logits=(logits, "+S"), positions=(positions, "S D"), mask=(mask, "S"))
-    check_bool(mask=mask)
     if window is not None and window < 0:
         raise ValueError(f"window must not be negative, got {window}")
     # Beyond, squares of what is not possible count.

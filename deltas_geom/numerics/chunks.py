@@ -1,5 +1,6 @@
 """Some points at a time: so few that what lies between stays in the cache, and no threads start."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ class Cut(NamedTuple):
     outputs: tuple[int, ...]
 
 
-def cut_points(tensor: Tensor, *dims: int, outputs: tuple[int, ...]) -> Cut | None:
+def cut_points(tensor: Tensor, *dims: int, outputs: tuple[int, ...], least: int = 1) -> Cut | None:
     """A cut for cameras and what is known of points, of which ``tensor`` ``(*B, V, N, K)`` tells N.
 
     Args:
@@ -34,13 +35,14 @@ def cut_points(tensor: Tensor, *dims: int, outputs: tuple[int, ...]) -> Cut | No
             operation on all their views starts threads.
         *dims: of the inputs after the cameras.
         outputs: of the outputs.
+        least: how many numbers of a point to reckon with where its views are fewer.
     """
     # A compiler fuses what lies between instead, and may not know the number of points.
     if torch.compiler.is_compiling():
         return None
     # The same however many threads torch may start: a pass costs what it costs with one.
-    size = max(_SMALLEST_CHUNK, SERIAL // max(1, tensor.shape[:-2].numel()))
-    count = tensor.shape[-2]
+    *batch, views, count, _ = tensor.shape
+    size = max(_SMALLEST_CHUNK, SERIAL // max(1, math.prod(batch) * max(views, least)))
     return Cut(alike(count, size), (0, *dims), outputs) if count > size else None
 
 

@@ -17,31 +17,7 @@ from deltas_geom.numerics.chunks import Cut, chunks, joined
 
 Function = Callable[..., tuple[Tensor, ...]]
 Inputs = tuple[Tensor | None, ...]
-
-
-class WithAdjoint:
-    """A function of :func:`recomputed` whose gradient needs less than the function again.
-
-    Where outputs solve equations, the gradient follows from the equations and the solution,
-    however that was found.
-
-    Attributes:
-        function: as for :func:`recomputed`; its first output alone has a gradient.
-        adjoint: from the gradients of the outputs, which inputs need one, and the inputs: the
-            gradient of each input or None, to first order.
-
-    Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 15 (implicit).
-    """
-
-    def __init__(
-        self, function: Function, adjoint: Callable[..., tuple[Tensor | None, ...]]
-    ) -> None:
-        self.function = function
-        self.adjoint = adjoint
-
-    def __call__(self, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-        """All outputs, differentiably."""
-        return self.function(*tensors)
+Adjoint = Callable[..., Inputs]
 
 
 def recomputed(
@@ -49,6 +25,7 @@ def recomputed(
     *tensors: Tensor | None,
     values: Function | None = None,
     cut: Cut | None = None,
+    adjoint: Adjoint | None = None,
 ) -> tuple[Tensor, ...]:
     """``function(*tensors)``, keeping nothing but ``tensors`` for its backward pass.
 
@@ -61,8 +38,13 @@ def recomputed(
         *tensors: inputs; those in a closure get no gradient.
         values: the same outputs by a faster route that need not be differentiable.
         cut: compute some points at a time.
+        adjoint: from the gradients of the outputs, which inputs need one, and the inputs: the
+            gradient of each input or None, to first order; of the first output alone, as the
+            others then have none. Where outputs solve equations, it follows from the equations
+            and the solution, however that was found.
 
-    Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 12 (checkpointing).
+    Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapters 12 (checkpointing) and
+    15 (implicit functions).
 
     Example:
         >>> x = torch.ones(3, requires_grad=True)
@@ -78,7 +60,7 @@ def recomputed(
         with torch.no_grad():
             return in_chunks(values, cut, *tensors)
     kind = _Traced if compiling else _Recomputed
-    outputs: tuple[Tensor, ...] = kind.apply(function, values, cut, *tensors)  # type: ignore[no-untyped-call]
+    outputs: tuple[Tensor, ...] = kind.apply(function, values, cut, adjoint, *tensors)  # type: ignore[no-untyped-call]
     return outputs
 
 
@@ -114,42 +96,51 @@ def _in_batch(tensor: Tensor | None) -> bool:
     return tensor is not None and torch._C._functorch.is_legacy_batchedtensor(tensor)
 
 
-class _Recomputed(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, function: Function, values: Function, cut: Cut | None, *tensors: Tensor | None
-    ) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        ctx.cut = cut
-        return _kept(ctx, function, partial(in_chunks, values, cut), tensors)
+class _Keeping(torch.autograd.Function):
+    """What keeps the inputs alone."""
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        needed, function, cut, tensors = (
-            ctx.needs_input_grad[3:],
-            ctx.function,
-            ctx.cut,
-            ctx.saved_tensors,
+    def forward(
+        ctx: Any,
+        function: Function,
+        values: Function,
+        cut: Cut | None,
+        adjoint: Adjoint | None,
+        *tensors: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        if not torch.compiler.is_compiling():
+            ctx.set_materialize_grads(False)
+        ctx.function, ctx.cut, ctx.adjoint = function, cut, adjoint
+        ctx.save_for_backward(*tensors)
+        outputs = in_chunks(values, cut, *tensors)
+        ctx.floating = [out.is_floating_point() for out in outputs]
+        ctx.mark_non_differentiable(
+            *(out for k, out in enumerate(outputs) if (adjoint and k) or not ctx.floating[k])
         )
-        nothing = (None,) * (3 + len(tensors))
+        return outputs
+
+
+class _Recomputed(_Keeping):
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        needed, function, cut = ctx.needs_input_grad[4:], ctx.function, ctx.cut
+        tensors, settings = ctx.saved_tensors, (None,) * 4
         if all(gradient is None for gradient in gradients):
-            return nothing
+            return *settings, *(None for _ in tensors)
         if torch.is_grad_enabled():  # a second derivative is wanted of what is done here
-            return (
-                *nothing[:3],
-                *_pulled(function, gradients, needed, *tensors, create_graph=True),
-            )
+            pulled = _pulled(function, gradients, needed, *tensors, create_graph=True)
+            return *settings, *pulled
         # A sum of gradients in a batch could not tell one from the other.
-        pull: Callable[..., Inputs] = partial(_pulled, function)
-        if isinstance(function, WithAdjoint) and not any(map(_in_batch, gradients)):
-            pull = function.adjoint
+        pull = partial(_pulled, function)
+        if ctx.adjoint and not any(map(_in_batch, gradients)):
+            pull = ctx.adjoint
         if cut is None:
-            return (*nothing[:3], *pull(gradients, needed, *tensors))
+            return *settings, *pull(gradients, needed, *tensors)
         pairs = zip(
             chunks(cut, gradients, cut.outputs), chunks(cut, tensors, cut.inputs), strict=True
         )
         parts = zip(*(pull(some, needed, *inputs) for some, inputs in pairs), strict=True)
-        return (*nothing[:3], *map(_together, parts, cut.inputs))
+        return *settings, *map(_together, parts, cut.inputs)
 
 
 def _together(parts: tuple[Tensor | None, ...], dim: int) -> Tensor | None:
@@ -193,24 +184,17 @@ def _pulled(
     return tuple(next(pulled) if asked else None for asked in needed)
 
 
-class _Traced(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, function: Function, values: Function, cut: Cut | None, *tensors: Tensor | None
-    ) -> tuple[Tensor, ...]:
-        outputs = _kept(ctx, function, values, tensors)
-        ctx.floating = tuple(out.is_floating_point() for out in outputs)
-        return outputs
-
+class _Traced(_Keeping):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        needed, function, tensors = ctx.needs_input_grad[3:], ctx.function, ctx.saved_tensors
+        needed, function = ctx.needs_input_grad[4:], ctx.function
+        tensors, settings = ctx.saved_tensors, (None,) * 4
         followed = tuple(g for g, has in zip(gradients, ctx.floating, strict=True) if has)
         # What depends on inputs alone the compiler would compute in the forward pass, and keep.
         never = (followed[0] > torch.inf).any()
         tensors = [None if t is None else torch.where(never, t.new_zeros(()), t) for t in tensors]
-        if isinstance(function, WithAdjoint):
-            return (None, None, None, *function.adjoint(followed, needed, *tensors))
+        if ctx.adjoint:
+            return *settings, *ctx.adjoint(followed, needed, *tensors)
         places = [k for k, t in enumerate(tensors) if t is not None and needed[k]]
 
         def of_needed(*needed: Tensor) -> tuple[Tensor, ...]:
@@ -221,18 +205,4 @@ class _Traced(torch.autograd.Function):
 
         _, pull, *_ = torch.func.vjp(of_needed, *(tensors[place] for place in places))
         pulled = dict(zip(places, pull(followed), strict=True))
-        return (None, None, None, *(pulled.get(k) for k in range(len(tensors))))
-
-
-def _kept(
-    ctx: Any, function: Function, values: Function, tensors: tuple[Tensor | None, ...]
-) -> tuple[Tensor, ...]:
-    """The values, after ``ctx`` was told what to keep for backward."""
-    ctx.function = function
-    ctx.save_for_backward(*tensors)
-    outputs = values(*tensors)
-    first_only = isinstance(function, WithAdjoint)
-    ctx.mark_non_differentiable(
-        *(out for k, out in enumerate(outputs) if (first_only and k) or not out.is_floating_point())
-    )
-    return outputs
+        return *settings, *(pulled.get(k) for k in range(len(tensors)))

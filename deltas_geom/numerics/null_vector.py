@@ -1,8 +1,9 @@
 """The null vector of symmetric 4x4 matrices (ldl.py), by arithmetic alone.
 
 The route is LDL with the last coordinate eliminated last (robust to the world's unit and
-origin), and inverse iterations. Where a bound on the error proves those to be enough (proof.py),
-that is all; elsewhere a Rayleigh quotient iteration follows, and a count of the eigenvalues below.
+origin), and inverse iterations. Two are all where a bound on the error proves those to be enough:
+good matches need no more, and gross outliers fail it. Elsewhere a Rayleigh quotient iteration
+follows, and a count of the eigenvalues below.
 Gradients come from one more Rayleigh step, solved in the complement of the vector, where they
 stay finite when other eigenvalues meet (there SVD's are NaN).
 
@@ -18,15 +19,17 @@ from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 from deltas_geom.numerics.ldl import (
-    Factors,
-    factor,
+    Pivots,
+    eliminate,
     multiply,
     rounding,
+    rounding_of,
     shifted,
+    solve_leading,
     solve_scaled,
     start,
 )
-from deltas_geom.numerics.proof import proved_vector
+from deltas_geom.numerics.symmetric3 import solve3
 from deltas_geom.numerics.vectors import (
     Symmetric4,
     Vector4,
@@ -87,6 +90,41 @@ def null_vector(
     return NullVector(tuple(map(merged, vector, some.vector)), merged(proved, some.simple))
 
 
+def proved_vector(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]:
+    """Vectors by two inverse iterations, and which of them are proved to be within ``accuracy``.
+
+    For M = [A b; b^T c] they start from x = (p, 1) with A p = -b, where M x = d3 e4. The first
+    yields y = x + t (A^-1 p, 0), M y = t x, with t = d3 / |x|^2, an upper bound of the eigenvalue.
+    The error of y is at most its residual by the distance to the second eigenvalue. The second
+    iteration divides it by at least the ratio of the two. The smallest eigenvalue of A is not below
+    s = 4 det A / trace(M)^2, nor the second of M, det M by the product of the others, below
+    s |x|^2.
+    """
+    f = eliminate(matrix)
+    p2 = f.l32  # p and q = A^-1 p, both negative
+    p1 = less(f.l31, f.l21, p2)
+    p0 = less(less(f.l30, f.l10, p1), f.l20, p2)
+    p = p0, p1, p2
+    q = solve_leading(f, p)
+    size = 1 + dot(p, p)
+    t = f.d3 / size
+    y = plus(p, t, q)
+    x = plus(p, f.d3 / (1 + dot(p, y)), solve_leading(f, y))
+
+    trace = matrix[0] + matrix[4] + matrix[7] + matrix[9]
+    inverse = (0.5 * trace).square() * f.i0 * f.i1 * f.i2  # 1 / s
+    # A tenth, and of an eigenvalue that holds the noise, is more than rounding can feign.
+    share = (t.abs() + rounding_of(trace)) * inverse
+    apart = (share > 0) & (share <= 0.1)
+    ratio = share / size
+    # |y| >= |x|, since p^T A^-1 p is positive; the residual is t^2 times q across x.
+    along = dot(p, q)
+    across = less(dot(q, q) * size, along, along)  # squared, times |x|^2
+    bound = (ratio * ratio * t).square() * across
+    proved = apart & (bound <= (0.9 * accuracy) ** 2 * size.square())
+    return (*x, torch.full_like(t, -1.0)), proved
+
+
 def _iterated(
     matrix: Symmetric4,
     *,
@@ -95,24 +133,23 @@ def _iterated(
 ) -> NullVector:
     noise = rounding(matrix)
     # Above the null space by the rounding of M, every pivot is positive.
-    factors = factor(shifted(matrix, -noise))
-    x = start(factors)
+    f = eliminate(shifted(matrix, -noise))
+    x = start(f)
     for _ in range(_INVERSE_ITERATIONS - 1):
-        x = solve_scaled(factors, x)
+        x = solve_scaled(f, x)
     x = unit(x)  # before it overflows: towards infinity each solve makes it longer
-    near = solve_scaled(factors, x)
+    near = solve_scaled(f, x)
     length = dot(near, near)
-    quotient = factors.pivots.d3 * dot(near, x) / length - noise
+    quotient = f.d3 * dot(near, x) / length - noise
     near, quotient = _nearer(matrix, scaled(near, length.rsqrt()), quotient, noise)
 
     # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
-    factors = factor(shifted(matrix, quotient + noise))
-    p = factors.pivots
-    simple = p.i0.sign() + p.i1.sign() + p.i2.sign() + p.d3.sign() == 2
-    vector = solve_scaled(factors, near)
+    f = eliminate(shifted(matrix, quotient + noise))
+    simple = f.i0.sign() + f.i1.sign() + f.i2.sign() + f.d3.sign() == 2
+    vector = solve_scaled(f, near)
     if product is not None:
         for _ in range(polish):
-            vector = _polished(factors, unit(vector), product)
+            vector = _polished(f, unit(vector), product)
     return NullVector(vector, simple)
 
 
@@ -136,13 +173,13 @@ def _nearer(
     """
     # Off the quotient itself, where a pivot of a simple matrix may vanish exactly.
     below = -0.4 * noise
-    factors = factor(shifted(matrix, quotient - below))
+    f = eliminate(shifted(matrix, quotient - below))
     same = 256 * torch.finfo(noise.dtype).eps
-    b = solve_scaled(factors, a)  # K b = d3 a with K = M - shift, and a^T K a = below
+    b = solve_scaled(f, a)  # K b = d3 a with K = M - shift, and a^T K a = below
     along, length = dot(a, b), dot(b, b)
     across = less(length, along, along)
     # K in the plane, times across: below * across, g * sqrt(across), -along * g.
-    g = less(factors.pivots.d3, below, along)
+    g = less(f.d3, below, along)
     half = 0.5 * torch.addcmul(below * across, along, g)
     step = half + torch.addcmul(half * half, g * g, across).clamp(min=0).sqrt()
     # Where both are one, or both quotients, within rounding, the iteration has converged.
@@ -151,17 +188,17 @@ def _nearer(
     of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
     of_b = torch.where(flat, one, -step)
     nearer = plus(scaled(a, of_a), of_b, b)
-    change = torch.where(flat, below - factors.pivots.d3 * along / length, step / across)
+    change = torch.where(flat, below - f.d3 * along / length, step / across)
     return nearer, quotient - change
 
 
-def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
+def _polished(f: Pivots, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
     """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
     image = product(x)
     mu = dot(x, image)
-    change = solve_scaled(factors, minus(image, mu, x))
+    change = solve_scaled(f, minus(image, mu, x))
     # What the solve amplifies is along x, and goes.
-    return minus(x, factors.pivots.d3.reciprocal(), minus(change, dot(x, change), x))
+    return minus(x, f.d3.reciprocal(), minus(change, dot(x, change), x))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
@@ -203,27 +240,7 @@ def solve_in_complement(matrix: Symmetric4, x: Vector4, mu: Tensor, g: Vector4) 
     a12 = less(less(m12, x1, q2), q1, x2)
     a22 = less(m22 - mu, 2 * x2, q2)
     reflect = beta * dot(u, g)
-    h0, h1, h2 = minus(g[:3], reflect, x[:3])
-
-    noise = rounding(matrix)
-    i0, definite0 = _reciprocal(a00, noise)
-    l10, l20 = a01 * i0, a02 * i0
-    i1, definite1 = _reciprocal(less(a11, l10, a01), noise)
-    t = less(a12, l20, a01)
-    l21 = t * i1
-    i2, definite2 = _reciprocal(less(less(a22, l20, a02), l21, t), noise)
-    definite = definite0 & definite1 & definite2
-    h1 = less(h1, l10, h0)
-    h2 = less(less(h2, l20, h0), l21, h1) * i2
-    h1 = less(h1 * i1, l21, h2)
-    h0 = less(less(h0 * i0, l10, h1), l20, h2)
-
-    reflect = beta * (x0 * h0 + x1 * h1 + x2 * h2)
-    solution = (*minus((h0, h1, h2), reflect, u[:3]), -reflect * u[3])
+    h, definite = solve3((a00, a01, a02, a11, a12, a22), minus(g[:3], reflect, x[:3]))
+    reflect = beta * dot(x[:3], h)
+    solution = (*minus(h, reflect, u[:3]), -reflect * u[3])
     return either(definite, solution, (0.0,) * 4)
-
-
-def _reciprocal(pivot: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """1 / pivot, and whether it is positive beyond rounding; elsewhere 1, with no gradient."""
-    positive = pivot > noise
-    return 1 / torch.where(positive, pivot, 1.0), positive

@@ -3,6 +3,8 @@
 Source: Golub and Van Loan, 4th ed., section 4.1.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -37,16 +39,19 @@ def _factor3(normal: Symmetric3) -> tuple[tuple[Tensor, ...], Tensor]:
     return (i0, i1, i2, l10, l20, l21), definite0 & definite1 & definite2
 
 
+def substituted3(factors: Sequence[Tensor], right: Vector3) -> Vector3:
+    """Solutions by LDL^T: inverse pivots and l10 l20 l21."""
+    (i0, i1, i2, l10, l20, l21), (b0, b1, b2) = factors, right
+    b1 = less(b1, l10, b0)
+    z2 = less(less(b2, l20, b0), l21, b1) * i2
+    z1 = less(b1 * i1, l21, z2)
+    return less(less(b0 * i0, l10, z1), l20, z2), z1, z2
+
+
 def solve3(normal: Symmetric3, right: Vector3) -> tuple[Vector3, Tensor]:
     """Solve semidefinite 3x3 systems; is each matrix definite beyond rounding?"""
-    (i0, i1, i2, l10, l20, l21), definite = _factor3(normal)
-    b0, b1, b2 = right
-    b1 = less(b1, l10, b0)
-    b2 = less(less(b2, l20, b0), l21, b1)
-    z2 = b2 * i2
-    z1 = less(b1 * i1, l21, z2)
-    z0 = less(less(b0 * i0, l10, z1), l20, z2)
-    return (z0, z1, z2), definite
+    factors, definite = _factor3(normal)
+    return substituted3(factors, right), definite
 
 
 def solve3_scaled(normal: Symmetric3, right: Vector3) -> tuple[Vector3, Tensor]:

@@ -7,14 +7,17 @@ product of the errors of x and of y, whose derivatives by pixels, weights and ca
 Source: Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 15 (implicit functions).
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from deltas_geom.numerics.ldl import multiply
 from deltas_geom.numerics.null_vector import solve_in_complement
 from deltas_geom.numerics.sums import over_points, product
-from deltas_geom.numerics.vectors import Vector3, Vector4, as_one, dot, either, minus, scaled
-from deltas_geom.triangulation.equations import Equations, Rig, out_of_frame
+from deltas_geom.numerics.vectors import Vector3, Vector4, as_one, dot, either, scaled
+from deltas_geom.triangulation.dlt import Numbers
+from deltas_geom.triangulation.equations import Equations, out_of_frame
 from deltas_geom.triangulation.observed import Observations, homogeneous_in_views
 from deltas_geom.triangulation.solution import of_length_one, of_trace_one
 from deltas_geom.triangulation.weights import Weights
@@ -59,7 +62,11 @@ def gradients_of(
     if of_cameras:
         stacked = [torch.stack(some, dim=-2) for some in (place, push, framed[1:])]
         sums = _over_points(equations.observed, (across, down), (along, below), *stacked)
-        proj = _of_cameras(rig, *sums)
+        cameras = rig.cameras
+        columns = through_centers(
+            *sums, inverse=cameras.inverse, places=cameras.centers, datum=rig.datum
+        )
+        proj = torch.cat(columns, dim=-1) * (1 - cameras.broken)[..., None, None]
     return proj, as_one((by_x, by_y), dtype), by_weight
 
 
@@ -101,26 +108,53 @@ def _pulled(
     scale = frame.unit * share / x[3]
     along = dot(g, x[:3]) / x[3]
     y = solve_in_complement(matrix, x, mu, (*scaled(g, scale), -along * scale))
-    # By the frame's origin and unit, which matter where the errors do not vanish: M x = mu x and
-    # M y = mu y + of_x leave little of what T^T M T says. In the world's frame they are fixed.
     by_unit = 2 * mu / (share * frame.unit) * (0.0 if equations.fixed else 1.0)
-    half, total = 0.5 * by_unit, frame.total
-    alpha = tuple(-half * (y[3] * x[k] + x[3] * y[k]) / total for k in range(3))
-    beta = by_unit * x[3] * y[3] / (2 * frame.unit * total)
-    constant = beta * (dot(frame.origin, frame.origin) - frame.unit.square())
-    constant = constant - dot(alpha, frame.origin)
-    framed = (constant, beta, *minus(alpha, 2 * beta, frame.origin))
+    framed = through_frame(x, y, frame.origin, frame.unit, by_unit / (2 * frame.total))
     return out_of_frame(frame, x), out_of_frame(frame, y), framed
 
 
-def _of_cameras(rig: Rig, near: Tensor, centers: Tensor) -> Tensor:
-    """``(*B, V, 3, 4)`` from such sums over points, and ``(*B, V, 4)`` of the frames."""
-    cameras, datum = rig.cameras, rig.datum
-    rows, last = near[..., :3], near[..., 3:]
-    offset = cameras.centers - datum
-    center = centers[..., 1:] + 2 * offset * centers[..., :1]
-    position = -(cameras.inverse * center.unsqueeze(-1)).sum(dim=-2)
-    position = position.unsqueeze(-1)  # by the last column, and through it by the others
-    rows = rows + last * datum.unsqueeze(-2) + position * cameras.centers.unsqueeze(-2)
-    found = torch.cat([rows, last + position], dim=-1)
-    return found * (1 - cameras.broken)[..., None, None]
+def through_frame(
+    x: Sequence[Numbers],
+    y: Sequence[Numbers],
+    origin: Sequence[Numbers],
+    unit: Numbers,
+    share: Numbers,
+) -> tuple[Numbers, ...]:
+    """What of the gradient by a view's squared weight the frame's origin and unit pass on.
+
+    They matter where the errors do not vanish: M x = mu x and M y = mu y + of_x leave little of
+    what T^T M T says.
+
+    Args:
+        x, y: four ``(*B, N)`` in the frame, tensors or arrays as all others.
+        origin, unit: of the frame.
+        share: the eigenvalue by the unit and by the sum of squared weights; 0 if it is fixed.
+
+    Returns:
+        Five: of 1, of the squared distance of a camera from the datum and of its coordinates.
+    """
+    o0, o1, o2 = origin
+    of_x, of_y = share * y[3], share * x[3]
+    square = of_x * x[3] / unit
+    twice = 2 * square
+    a, b, c = (-(of_x * x[k] + of_y * y[k] + twice * origin[k]) for k in range(3))
+    constant = -square * (o0 * o0 + o1 * o1 + o2 * o2 + unit * unit) - (a * o0 + b * o1 + c * o2)
+    return constant, square, a, b, c
+
+
+def through_centers(
+    near: Numbers, centers: Numbers, *, inverse: Numbers, places: Numbers, datum: Numbers
+) -> tuple[Numbers, Numbers]:
+    """Gradients by the columns of cameras ``(*B, V, 3, 3)`` and ``(*B, V, 3, 1)``.
+
+    Args:
+        near: ``(*B, V, 3, 4)`` by those of points counted from the datum; tensor or array.
+        centers: ``(*B, V, 4)`` by squared distances from the datum and coordinates there.
+        inverse, places, datum: of the cameras, see :class:`Cameras` and :class:`Rig`.
+    """
+    last = near[..., 3:]
+    center = centers[..., 1:] + 2 * (places - datum) * centers[..., :1]
+    # By the last column, and through it by the others.
+    position = -(inverse * center[..., None]).sum(-2)[..., None]
+    rows = near[..., :3] + last * datum[..., None, :] + position * places[..., None, :]
+    return rows, last + position

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import with_one
-from deltas_geom.checks import check_positive, check_shapes
+from deltas_geom.checks import check_positive, check_tensor
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
@@ -25,9 +25,9 @@ from deltas_geom.numerics.vectors import dot
 from deltas_geom.triangulation.bearings import (
     Bearings,
     angles_of,
-    check_bearings,
     see_rays,
 )
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.rays import triangulate_rays
 from deltas_geom.triangulation.refine import Refined, refine_points
 from deltas_geom.triangulation.reprojection import mean_of
@@ -84,7 +84,7 @@ def triangulate_robust_rays(
         >>> result.inliers[:, 0].tolist(), result.points.round(decimals=3)
         ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
-    check_bearings(cam_from_world, rays, weights, mask)
+    check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
     if not 0 < threshold < math.pi / 2:
         raise ValueError(f"threshold must be positive and below pi / 2, got {threshold}")
 
@@ -147,8 +147,9 @@ def refine_rays(
 
     Source: as of :func:`refine_points`.
     """
-    check_shapes(rays=(rays, "V N 3"), points=(points, "N 3"))
-    check_bearings(cam_from_world, rays, weights, mask)
+    check_observed(
+        cam_from_world=cam_from_world, rays=rays, points=points, weights=weights, mask=mask
+    )
     check_positive(scale=scale)
     seen = see_rays(cam_from_world, rays, weights, mask)
     cameras = _aimed(seen)
@@ -199,9 +200,8 @@ def ray_covariance(
 
     Source: as of :func:`point_covariance`.
     """
-    check_shapes(
-        cam_from_world=(cam_from_world, "+V 4 4"), weights=(weights, "V N"), points=(points, "N 3")
-    )
+    check_tensor(weights=weights)
+    check_observed(cam_from_world=cam_from_world, points=points, weights=weights, mask=mask)
     poses, place = promoted(cam_from_world[..., :3, :], points)
     # What is not finite has a ray of length 0, so that it is told, and passes no gradient.
     (near, _), (rows, _) = finite_or_zero(place), finite_or_zero(poses, dims=2)

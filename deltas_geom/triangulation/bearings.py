@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_batch, check_bool
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
-from deltas_geom.numerics.vectors import Vector3, dot, minus, scaled
-from deltas_geom.triangulation.observed import finite_cameras
+from deltas_geom.numerics.vectors import Symmetric3, Vector3, dot, minus, scaled
+from deltas_geom.triangulation.observed import check_observed, finite_cameras
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
 from deltas_geom.triangulation.rig_frame import datum_of
 from deltas_geom.triangulation.solution import in_world, kept
@@ -58,26 +57,12 @@ class Bearings(NamedTuple):
             return (ahead | self.weights.unused).all(dim=-2)
 
 
-def check_bearings(
-    cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> torch.Size:
-    """The batch dims to which all broadcast; raise unless rays ``(*B, V, N, 3)`` fit cameras."""
-    batch = check_batch(
-        cam_from_world=(cam_from_world, "+V 4 4"),
-        rays=(rays, "V N 3"),
-        weights=(weights, "V N"),
-        mask=(mask, "V N"),
-    )
-    check_bool(mask=mask)
-    return batch
-
-
 def see_rays(
     cam_from_world: Tensor, rays: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> Bearings:
     """Tell used rays ``(*B, V, N, 3)`` of cameras ``(*B, V, 4, 4)`` from others."""
     work = solver_dtype(rays)
-    batch = check_bearings(cam_from_world, rays, weights, mask)
+    batch = check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
     pose, broken = finite_cameras(cam_from_world[..., :3, :])  # whatever the last row
     x, y, z = (one.to(work, memory_format=torch.contiguous_format) for one in rays.unbind(dim=-1))
     with torch.no_grad():
@@ -121,11 +106,7 @@ def describe_rays(
         distance = dot(offset, offset)
         share = safe_divide(weights.squared.expand_as(along), distance, used)
         share = safe_divide(share, distance, used)
-        x, y, z = offset
-        xx, yy, zz = x * x, y * y, z * z
-        entries = (yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy)
-        information = [(share * entry).sum(dim=-2) for entry in entries]
-        inverse = inverse_information(information, used.sum(dim=-2) >= 2)
+        inverse = inverse_information(across_sums(share, offset), used.sum(dim=-2) >= 2)
         found["covariance"] = unscaled(inverse, weights.largest.squeeze(-2))
     return found
 
@@ -136,6 +117,21 @@ def angles_of(seen: Bearings, offset: Vector3, used: Tensor) -> tuple[Tensor, Te
     # sqrt and atan2 have no slope at a perfect match; the gradient there is taken as 0.
     sine = safe_sqrt(torch.where(used, dot(beside, beside), 0.0))
     return along, torch.atan2(sine, torch.where(used, along, 1.0))
+
+
+def across_sums(weight: Tensor, vector: Vector3) -> Symmetric3:
+    """Sums over views of w (|v|^2 - v v^T), of w and v ``(*B, V, N)``: six ``(*B, N)``.
+
+    Between points and vectors of unit length that is the squared distance from their lines.
+    """
+    x, y, z = vector
+    a, b, c = scaled(vector, weight)
+    entries = (
+        torch.addcmul(b * y, c, z), -a * y, -a * z,
+        torch.addcmul(a * x, c, z), -b * z,
+        torch.addcmul(a * x, b, y),
+    )  # fmt: skip
+    return tuple(entry.sum(dim=-2) for entry in entries)
 
 
 def across(directions: Vector3, vector: Vector3) -> Vector3:

@@ -12,29 +12,31 @@ Multiplied out, a pixel of weight w adds to A^T A
     + p_1^T p_1 + p_2^T p_2]
 
 which is linear in x^2 + y^2, x, y and 1, so what belongs to a camera is found once for all points.
-Many points are solved so, few by the rows, which ``short.py`` stacks as :func:`rows` does.
+Many points are solved so, few by the rows.
 
 Source: Hartley and Zisserman, 2nd ed., section 12.2, without weights.
 """
 
+from typing import Any, TypeVar
+
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom.numerics.sums import over_views
 
+Numbers = TypeVar("Numbers", Tensor, NDArray[Any])
 
-def rows(proj: Tensor, pixels: Tensor, weights: Tensor | None = None) -> Tensor:
-    """A: the weighted equations ``(*B, N, 2 V, 4)`` of N points.
+
+def rows(proj: Numbers, pixels: Numbers) -> Numbers:
+    """A without weights: the equations ``(*B, N, V, 2, 4)`` of N points, two of each view.
 
     Args:
-        proj: ``(*B, N, V, 3, 4)`` rows p1, p2, p3.
-        pixels: ``(*B, N, V, 2)``.
-        weights: ``(*B, N, V)`` or None for all 1.
+        proj: ``(*B, N, V, 3, 4)`` rows p1, p2, p3; tensor or array.
+        pixels: ``(*B, N, V, 2)``, likewise.
     """
-    equations = pixels.unsqueeze(-1) * proj[..., 2:, :] - proj[..., :2, :]
-    if weights is not None:
-        equations = equations * weights[..., None, None]
-    return equations.flatten(-3, -2)
+    equations: Numbers = pixels[..., None] * proj[..., 2:, :] - proj[..., :2, :]
+    return equations
 
 
 def normal_matrix(

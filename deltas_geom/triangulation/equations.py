@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_positive
-from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.numerics.arithmetic import only, unless_all
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
@@ -14,8 +14,8 @@ from deltas_geom.triangulation.observed import (
     Cameras,
     Observations,
     homogeneous_in_views,
+    in_views,
 )
-from deltas_geom.triangulation.reprojection import in_views
 from deltas_geom.triangulation.rig_frame import (
     Moments,
     RigFrame,
@@ -93,10 +93,9 @@ class Equations(NamedTuple):
     def in_front(self, points: Vector3) -> Tensor:
         """As of :class:`Linear`."""
         # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-        depth, unused = in_views(self.rig.near[..., 2, :], points), self.observed.weights.unused
-        if not surely_all(~unused):
-            depth = torch.where(unused, 1.0, depth)
-        return depth.amin(dim=-2) > 0
+        depth = in_views(self.rig.near[..., 2, :], *points)
+        used = unless_all(~self.observed.weights.unused)
+        return only(depth, used, other=1.0).amin(dim=-2) > 0
 
 
 def rig_of(cameras: Cameras) -> Rig:

@@ -9,17 +9,19 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import only, without_autocast
 from deltas_geom.numerics.sums import over_views
+from deltas_geom.numerics.symmetric3 import inverse3
 from deltas_geom.numerics.vectors import Vector3, dot, either, scaled
 from deltas_geom.triangulation.bearings import (
     Bearings,
     across,
-    check_bearings,
+    across_sums,
     describe_rays,
     see_rays,
 )
 from deltas_geom.triangulation.judge import judge, ok
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
 
@@ -115,7 +117,8 @@ def _triangulate(
     covariance: bool,
     max_residual: float | None,
 ) -> Triangulation:
-    check_bearings(*inputs)
+    cam_from_world, rays, weights, mask = inputs
+    check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
 
     def moved(seen: Bearings, points: Vector3, valid: Tensor) -> Vector3:
         return _stepped(seen, points, valid) if stepped else points
@@ -132,7 +135,7 @@ def _triangulate(
         solve=solve,
         follow=lambda seen, _, valid: moved(seen, _midpoint(seen)[0], valid),
         describe=describe_rays,
-        dtype=inputs[1].dtype,
+        dtype=rays.dtype,
         covariance=covariance,
         max_residual=max_residual,
     )
@@ -167,27 +170,17 @@ def _nearest(directions: Vector3, weight: Tensor, target: Vector3) -> tuple[Vect
     """Minimises the sum of weight |(1 - d d^T) x - target|^2, the target orthogonal to d.
 
     Also the mean squared sine of the directions to their common one, up to a factor 1 to 3. Where
-    it is 0 within rounding x is any finite vector, and its gradient is finite.
+    it is 0 within rounding x is 0, without gradient.
     """
-    d0, d1, d2 = directions
-    v0, v1, v2 = weight * d0, weight * d1, weight * d2
-    n00, n01, n02 = ((weight - v0 * d0).sum(-2), -(v0 * d1).sum(-2), -(v0 * d2).sum(-2))
-    n11, n12, n22 = (weight - v1 * d1).sum(-2), -(v1 * d2).sum(-2), (weight - v2 * d2).sum(-2)
-    c00, c01, c02 = n11 * n22 - n12 * n12, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11
-    c11, c12, c22 = n00 * n22 - n02 * n02, n01 * n02 - n00 * n12, n00 * n11 - n01 * n01
-    determinant = n00 * c00 + n01 * c01 + n02 * c02
+    c00, c01, c02, c11, c12, c22 = inverse3(across_sums(weight, directions))
     with torch.no_grad():
+        # The trace of an inverse is at most 3 by the smallest eigenvalue.
         total = (c00 + c11 + c22) * weight.sum(dim=-2)
-        share = safe_divide(determinant, total, total > 0)
+        share = safe_divide(torch.ones_like(total), total, total > 0)
         definite = share > 64 * torch.finfo(share.dtype).eps
-    safe = torch.where(definite, determinant, 1.0)
-    r0, r1, r2 = ((weight * component).sum(dim=-2) / safe for component in target)
-    nearest = (
-        c00 * r0 + c01 * r1 + c02 * r2,
-        c01 * r0 + c11 * r1 + c12 * r2,
-        c02 * r0 + c12 * r1 + c22 * r2,
-    )
-    return nearest, torch.where(definite, share, 0.0)
+    right = tuple(only((weight * part).sum(dim=-2), definite) for part in target)
+    rows = (c00, c01, c02), (c01, c11, c12), (c02, c12, c22)
+    return tuple(dot(row, right) for row in rows), only(share, definite)
 
 
 @torch.no_grad()

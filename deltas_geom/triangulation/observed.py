@@ -11,11 +11,24 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.checks import check_batch, check_bool
+from deltas_geom.checks import check_batch
 from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
+
+_DIMS = {
+    "proj": "+V 3 4",
+    "cam_from_world": "+V 4 4",
+    "pixels": "V N 2",
+    "rays": "V N 3",
+    "points": "N 3",
+    "weights": "V N",
+    "mask": "V N",
+    "used": "V N",
+    "covariance": "N 3 3",
+    "pose_covariance": "V 6 6",
+}
 
 
 class Cameras(NamedTuple):
@@ -40,7 +53,7 @@ def cameras_of(proj: Tensor) -> Cameras:
     Source: Hartley and Zisserman, 2nd ed., section 6.2.4.
     """
     clean, broken = finite_cameras(proj)
-    inverse, _ = inverted(clean[..., :3])
+    inverse = _inverses(clean[..., :3])
     return Cameras(clean, broken, inverse, -(inverse * clean[..., 3:].mT).sum(dim=-1))
 
 
@@ -51,7 +64,7 @@ def finite_cameras(proj: Tensor) -> tuple[Tensor, Tensor]:
     finite = clean.detach().abs().amax(dim=(-2, -1)) < farthest(work)  # NaN is not below
     if not surely_all(finite):
         # Double where: what is not used must pass no gradient and no NaN.
-        clean = torch.where(finite[..., None, None], proj, 0.0).to(work)
+        clean = torch.where(finite[..., None, None], clean, 0.0)
     return clean, (~finite).to(work)
 
 
@@ -114,28 +127,16 @@ def farthest(work: torch.dtype) -> float:
     return float(torch.finfo(work).max ** 0.25)
 
 
-def check_observed(
-    proj: Tensor, pixels: Tensor, weights: Tensor | None, mask: Tensor | None
-) -> torch.Size:
-    """The batch dims of pixels ``(*B, V, N, 2)`` seen by cameras ``(*B, V, 3, 4)``.
+def check_observed(**named: Tensor | None) -> torch.Size:
+    """The batch dims to which arguments of these names broadcast, None being left out.
 
-    Raise unless weights and mask ``(*B, V, N)`` fit both, and the mask is bool.
+    Raise as :func:`check_batch` unless each has the dims of its name, and all fit each other.
     """
-    batch = check_batch(
-        proj=(proj, "+V 3 4"),
-        pixels=(pixels, "V N 2"),
-        weights=(weights, "V N"),
-        mask=(mask, "V N"),
-    )
-    check_bool(mask=mask)
-    return batch
+    return check_batch(**{name: (tensor, _DIMS[name]) for name, tensor in named.items()})
 
 
-def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses ``(*B, 3, 3)``, 0 with zero gradient if singular within rounding; are they regular?
-
-    Regular is ``(*B, 1, 1)``.
-    """
+def _inverses(matrix: Tensor) -> Tensor:
+    """Of ``(*B, 3, 3)``; 0 with zero gradient if singular within rounding."""
     cofactors = torch.linalg.cross(matrix.roll(-1, dims=-2), matrix.roll(-2, dims=-2))
     determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(dim=-1)[..., None, None]
     with torch.no_grad():
@@ -144,7 +145,7 @@ def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
         # The square of the determinant, in the gradient, has to be representable.
         regular = (size > limits.tiny**0.4) & (size < limits.max**0.4)
         regular = regular & (size > 4 * limits.eps * product)
-    return safe_divide(cofactors.mT, determinant, regular), regular
+    return safe_divide(cofactors.mT, determinant, regular)
 
 
 def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,15 +154,17 @@ def homogeneous_in_views(proj: Tensor, places: Sequence[Tensor]) -> tuple[Tensor
     Three ``(*B, V, N)``.
     """
     if torch.compiler.is_compiling():
-        a, b, c = (_linear(row, places) for row in proj.unbind(dim=-2))
+        # Row by row, which a compiler fuses with what stands around it.
+        a, b, c = (in_views(row, *places) for row in proj.unbind(dim=-2))
         return a, b, c
     rows = proj.transpose(-3, -2).flatten(-3, -2)  # all of p1, all of p2, all of p3
     a, b, c = product(rows, torch.stack(tuple(places), dim=-2)).chunk(3, dim=-2)
     return a, b, c
 
 
-def _linear(row: Tensor, values: Sequence[Tensor]) -> Tensor:
-    """Row by row, which a compiler fuses with what stands around it."""
-    factors = row.unsqueeze(-1).unbind(dim=-2)
-    parts = [f * value.unsqueeze(-2) for f, value in zip(factors, values, strict=True)]
-    return sum(parts[1:], parts[0])
+def in_views(row: Tensor, x: Tensor, y: Tensor, z: Tensor, w: Tensor | None = None) -> Tensor:
+    """A row ``(*B, V, 4)`` of each camera times points, each ``(*B, N)``: ``(*B, V, N)``."""
+    total = row[..., 3:] if w is None else row[..., 3:] * w.unsqueeze(-2)
+    for axis, component in enumerate((x, y, z)):
+        total = torch.addcmul(total, row[..., axis, None], component.unsqueeze(-2))
+    return total

@@ -67,12 +67,9 @@ def operation(
 
     cut = None
     if not listed and inputs[1] is not None:
-        # Fewer points where views are few: two rays and what lies between are 8 numbers, too.
-        *batch, views, count, size = inputs[1].shape
-        shape = (*batch, views, -(-8 // max(1, views)), count, size)
-        like = inputs[1].unsqueeze(-3).expand(shape)
         outputs = (*(_POINTS.get(name, -1) for name in names), -1)
-        cut = cut_points(like, -2, *(-1 for _ in inputs[2:]), outputs=outputs)
+        # Of two rays what lies between is 8 numbers a point, too.
+        cut = cut_points(inputs[1], -2, *(-1 for _ in inputs[2:]), outputs=outputs, least=8)
     compute, values = partial(computed, True), partial(computed, False)
     *fields, status = recomputed(compute, *inputs, values=values, cut=cut)
     known: dict[str, Any] = dict.fromkeys(record._fields) | dict(zip(names, fields, strict=True))

@@ -16,10 +16,11 @@ from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.bearings import (
     Bearings,
     across,
-    check_bearings,
+    across_sums,
     describe_rays,
     see_rays,
 )
+from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
 from deltas_geom.triangulation.rig_frame import RigFrame, camera_moments, rig_frame, rig_sums
@@ -71,7 +72,7 @@ def triangulate_rays(
         >>> result.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    check_bearings(cam_from_world, rays, weights, mask)
+    check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
     return operation(
         Triangulation,
         (cam_from_world, rays, weights, mask),
@@ -134,14 +135,8 @@ def _pose(
 
 def _normal_matrix(directions: Vector3, offset: Vector3, squared: Tensor) -> Symmetric4:
     """Sum of w^2 P^T (1 - d d^T) P, P = [1 | offset]."""
-    d0, d1, d2 = directions
-    # The part of the offset across the ray.
-    a0, a1, a2 = across(directions, offset)
-    w, v0, v1, v2 = squared, squared * d0, squared * d1, squared * d2
-    entries = (
-        w - v0 * d0, -v0 * d1, -v0 * d2, w * a0,
-        w - v1 * d1, -v1 * d2, w * a1,
-        w - v2 * d2, w * a2,
-        w * dot((a0, a1, a2), (a0, a1, a2)),
-    )  # fmt: skip
-    return tuple(entry.sum(dim=-2) for entry in entries)
+    m00, m01, m02, m11, m12, m22 = across_sums(squared, directions)
+    beside = across(directions, offset)
+    entries = *scaled(beside, squared), squared * dot(beside, beside)
+    m03, m13, m23, m33 = (entry.sum(dim=-2) for entry in entries)
+    return m00, m01, m02, m03, m11, m12, m13, m22, m23, m33

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
-from deltas_geom.checks import batch_shape, check_positive, check_shapes
+from deltas_geom.checks import check_positive
 from deltas_geom.numerics.arithmetic import without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
@@ -30,9 +30,9 @@ from deltas_geom.triangulation.observed import (
     homogeneous_in_views,
     observe,
 )
-from deltas_geom.triangulation.robust_loss import Loss, robust_loss, second_derivative
+from deltas_geom.triangulation.robust_loss import Loss, robust_loss
 
-_Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+_Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
 _End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
 _Descent = Callable[["_Problem", int], _End]
 _FARTHEST = 1e10  # px: a projection farther out than this is as good as behind the camera
@@ -113,9 +113,7 @@ def refine_points(
         >>> refined.points.round(decimals=3)
         tensor([[0.2000, 0.1000, 2.0000]])
     """
-    seen = check_observed(proj, pixels, weights, mask)
-    check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    batch_shape(seen, points.shape[:-2])
+    batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask, points=points)
     if loss not in ("squared", "huber", "cauchy"):
         raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy', got {loss!r}")
     if gradient not in ("unrolled", "implicit"):
@@ -125,7 +123,7 @@ def refine_points(
     check_positive(scale=scale)
 
     def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:
-        problem = _pose(partial(robust_loss, loss, scale), seen, *inputs)
+        problem = _pose(partial(robust_loss, loss, scale), batch, *inputs)
         return _outward(problem, *descend(problem, steps), dtype=points.dtype)
 
     unrolled, implicit = partial(refined, _descend), partial(refined, _descend_implicitly)
@@ -182,7 +180,6 @@ class _Fit(NamedTuple):
         offset: x and y ``(*B, V, N)`` px, from the pixels to there.
         inverse: ``(*B, V, N)`` 1 / depth.
         influence: ``(*B, V, N)`` rho', or () if all alike.
-        bend: ``(*B, V, N)`` 2 rho'', or ().
         error: ``(*B, N)`` px^2, weighted sum of the squared distances.
         cost: ``(*B, N)`` px^2, of the loss, without gradient; infinite if not in front of all.
     """
@@ -191,7 +188,6 @@ class _Fit(NamedTuple):
     offset: tuple[Tensor, Tensor]
     inverse: Tensor
     influence: Tensor
-    bend: Tensor
     error: Tensor
     cost: Tensor
 
@@ -209,12 +205,12 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
     dx, dy = x - px, y - py
     distance = torch.addcmul(dx * dx, dy, dy)
     error = (observed.weights.squared * distance).sum(dim=-2)
-    rho, influence, bend = problem.robust(distance)
+    rho, influence = problem.robust(distance)
     with torch.no_grad():
         behind = ((depth - c) * observed.weights.used).sum(dim=-2) > 0
         cost = error if rho is distance else (observed.weights.squared * rho).sum(dim=-2)
     cost = torch.where(behind, torch.inf, cost.detach())
-    return _Fit((x, y), (dx, dy), inverse, influence, bend, error, cost)
+    return _Fit((x, y), (dx, dy), inverse, influence, error, cost)
 
 
 def _descend(problem: _Problem, steps: int) -> _End:
@@ -269,16 +265,20 @@ def _descend_implicitly(problem: _Problem, steps: int) -> _End:
     They are -H^-1 dg with the cost's whole second derivative H. Gauss-Newton's normal matrix,
     which leaves out how residuals and losses bend, would be wrong by their share.
     """
+
+    def downhill(*points: Tensor) -> Vector3:
+        return _normal_equations(problem, _fit(problem, points))[1]
+
     with torch.no_grad():
         end, _, valid = _descend(problem, steps)
-    end = tuple(component.detach() for component in end)
-    fit = _fit(problem, end)
-    normal, right = _normal_equations(problem, fit)
-    seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
-    with torch.no_grad():
-        counted = squared * fit.influence, squared * fit.bend
-        hessian = second_derivative(normal, problem.proj, *seen, *counted)
-    change, strict = solve3_scaled(tuple(entry.detach() for entry in hessian), right)
+        end = tuple(component.detach() for component in end)  # no_grad leaves tangents
+        _, pull, *_ = torch.func.vjp(downhill, *end)
+        none, one = torch.zeros_like(end[0]), torch.ones_like(end[0])
+        (a, b, c), (_, d, e), (_, _, f) = map(
+            pull, ((one, none, none), (none, one, none), (none, none, one))
+        )
+        hessian = tuple(-entry.detach() for entry in (a, b, c, d, e, f))
+    change, strict = solve3_scaled(hessian, downhill(*end))
     points = tuple(
         # A gradient of 0 to the start, not a missing one; of the step no value.
         p + 0 * s + torch.where(strict & valid, d - d.detach(), 0.0)

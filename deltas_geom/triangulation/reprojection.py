@@ -1,13 +1,12 @@
 """Points as views see them again: projections, distances from pixels, angles between rays."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.numerics.arithmetic import only, surely_all, unless_all
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.observed import homogeneous_in_views
 
@@ -46,31 +45,16 @@ def projected(x: Tensor, y: Tensor, z: Tensor, used: Tensor) -> Reprojection:
     return Reprojection(x * inverse, y * inverse, inverse, z, seen)
 
 
-def in_views(row: Tensor, points: Sequence[Tensor]) -> Tensor:
-    """A row ``(*B, V, 4)`` of each camera times points, three ``(*B, N)``: ``(*B, V, N)``."""
-    total = row[..., 3:]
-    for axis, component in enumerate(points):
-        total = torch.addcmul(total, row[..., axis, None], component.unsqueeze(-2))
-    return total
-
-
-def residual_of(found: Reprojection, x: Tensor, y: Tensor, squared: Tensor) -> Tensor:
-    """Weighted RMS distance ``(*B, N)`` px from pixels, x and y ``(*B, V, N)``."""
-    return mean_of(squared_errors(found, x, y), found.seen, squared)
-
-
 def squared_errors(found: Reprojection, x: Tensor, y: Tensor) -> Tensor:
     """Squared distances ``(*B, V, N)`` px^2 from pixels, x and y ``(*B, V, N)``; 0 if not seen."""
-    dx, dy = found.x - x, found.y - y
-    if not surely_all(found.seen):
-        dx, dy = torch.where(found.seen, dx, 0.0), torch.where(found.seen, dy, 0.0)
+    known = unless_all(found.seen)
+    dx, dy = only(found.x - x, known), only(found.y - y, known)
     return torch.addcmul(dx * dx, dy, dy)
 
 
 def mean_of(errors: Tensor, seen: Tensor, squared: Tensor) -> Tensor:
     """Weighted RMS ``(*B, N)`` of squared errors ``(*B, V, N)``, with squared weights."""
-    if not surely_all(seen):
-        squared = torch.where(seen, squared, 0.0)
+    squared = only(squared, unless_all(seen))
     sums, total = (errors * squared).sum(dim=-2), squared.sum(dim=-2)
     return safe_sqrt(safe_divide(sums, total, total > 0))
 

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_bool, check_depth_range, check_positive, check_shapes
+from deltas_geom.checks import check_depth_range, check_positive, check_shapes
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 
@@ -128,7 +128,6 @@ class Triangulation(Record):
             outside = beyond(self.depth[..., view, :], depth_range)
         else:
             check_shapes(depth=(self.depth, "V N"), used=(used, "V N"))
-            check_bool(used=used)
             outside = (beyond(self.depth, depth_range) & used).any(dim=-2)
         return without(self, outside, Status.OUT_OF_RANGE)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.numerics.arithmetic import only, unless_all
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, dot, scaled
 from deltas_geom.triangulation.weights import Weights
@@ -106,8 +106,7 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         enough = count >= 2
         posed = enough & (reach > least)
         apart = spread > 1e-3 * torch.finfo(size.dtype).eps * size
-    if not surely_all(apart):
-        spread = torch.where(apart, spread, 1.0)
+    spread = only(spread, unless_all(apart), other=1.0)
     length = spread * spread.rsqrt()  # not sqrt, for which torch starts threads
     return RigFrame(origin, length, total, middle, reach, posed, enough, broken == 0)
 

@@ -94,7 +94,7 @@ def triangulate_robust(
         >>> result.inliers[:, 0].tolist(), result.points.round(decimals=3)
         ([True, True, False, True], tensor([[0.2000, 0.1000, 2.0000]]))
     """
-    batch = check_observed(proj, pixels, weights, mask)
+    batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask)
     check_positive(threshold=threshold)
     if min_inliers < 2:
         raise ValueError(f"min_inliers must be 2 or more, got {min_inliers}")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from deltas_geom.triangulation.dlt import rows
 from deltas_geom.triangulation.judge import REASONS
 from deltas_geom.triangulation.observed import Cameras
 from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
@@ -148,7 +149,7 @@ def solve(
         cameras = np.empty((*last.shape, 4))
         cameras[..., :3] = matrix
         cameras[..., 3] = last / unit[..., None, None]
-        equations = seen[..., None] * cameras[..., 2:, :] - cameras[..., :2, :]
+        equations = rows(cameras, seen)
         values, vectors = _null_vectors(
             equations * share[..., None, None], exactly=fixed or dtype.itemsize == 8
         )
@@ -264,8 +265,8 @@ def describe(rig: ShortRig, solved: Solved) -> tuple[Array, Array, Array, Array]
         seen = solved.used & valid & (depth > 0)
         from_datum = np.where(valid, solved.points - rig.datum, 0.0)
         place = np.concatenate([rig.proj[..., :3], rig.near[..., None]], axis=-1)
-        rows = place[..., None, :, :2, :3] @ from_datum[..., None, :, None]
-        pixels = (rows[..., 0] + place[..., None, :, :2, 3]) / depth[..., None]
+        ahead = place[..., None, :, :2, :3] @ from_datum[..., None, :, None]
+        pixels = (ahead[..., 0] + place[..., None, :, :2, 3]) / depth[..., None]
         offset = np.where(seen[..., None], pixels - solved.pixels, 0.0)
         squared = np.where(seen, solved.share * solved.share, 0.0)
         apart = (offset * offset).sum(axis=-1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from deltas_geom.triangulation.adjoint import through_centers, through_frame
 from deltas_geom.triangulation.short import Array, ShortRig, Solved
 
 
@@ -30,9 +31,15 @@ def gradients(
         squared = solved.share * solved.share
         by_pixel = deep[..., None] * error + depth[..., None] * pushed
         by_pixel = -squared[..., None] * by_pixel
-        constant, linear, square = _by_frame(solved, x, push, mu * (not fixed))
+        total = np.maximum(squared.sum(axis=-1), 1.0)
+        place, y, origin = (
+            [v[..., k] for k in range(v.shape[-1])] for v in (x, push, solved.origin)
+        )
+        by_frame = mu * (not fixed) / (solved.unit * total)
+        constant, square, *linear = through_frame(place, y, origin, solved.unit, by_frame)
+        bent = np.stack([square, *linear], axis=-1)
         distance = (rig.offset * rig.offset).sum(axis=-1)
-        by_square = constant[..., None] + linear @ np.swapaxes(rig.offset, -1, -2)
+        by_square = constant[..., None] + bent[..., 1:] @ np.swapaxes(rig.offset, -1, -2)
         by_square = by_square + square[..., None] * distance[..., None, :]
         by_square = by_square - (error * pushed).sum(axis=-1)
         by_size = 2 * solved.share / solved.largest * by_square
@@ -40,9 +47,11 @@ def gradients(
         if of_cameras:
             places = _from_datum(solved, x), _from_datum(solved, push)
             near = _over_points(solved, squared, error, pushed, *places)
-            bent = np.concatenate([linear, square[..., None]], axis=-1)
             centers = np.swapaxes(np.broadcast_to(squared, solved.depth.shape), -1, -2) @ bent
-            proj = _of_cameras(rig, near, centers)
+            columns = through_centers(
+                near, centers, inverse=rig.inverse, places=rig.centers, datum=rig.datum
+            )
+            proj = np.where(rig.finite[..., None, None], np.concatenate(columns, axis=-1), 0.0)
         return proj, np.moveaxis(by_pixel, -2, -3), np.swapaxes(by_size, -1, -2)
 
 
@@ -57,19 +66,6 @@ def _pushed(solved: Solved, x: Array, gradient: Array, valid: Array) -> tuple[Ar
     shares = (np.swapaxes(others, -1, -2) @ of_x[..., None])[..., 0] / gaps
     found: Array = (others @ shares[..., None])[..., 0]
     return found, mu
-
-
-def _by_frame(solved: Solved, x: Array, push: Array, mu: Array) -> tuple[Array, Array, Array]:
-    """By a view's squared weight through the frame: of 1, of its offset and of that squared."""
-    squared = solved.share * solved.share
-    total = np.maximum(squared.sum(axis=-1), 1.0)
-    by_unit = 2 * mu / solved.unit
-    by_origin = x[..., 3:] * push[..., :3] + push[..., 3:] * x[..., :3]
-    by_origin = -0.5 * by_unit[..., None] * by_origin / total[..., None]
-    square = by_unit * x[..., 3] * push[..., 3] / (2 * solved.unit * total)
-    reach = (solved.origin * solved.origin).sum(axis=-1)
-    constant = square * (reach - solved.unit**2) - (by_origin * solved.origin).sum(axis=-1)
-    return constant, by_origin - 2 * square[..., None] * solved.origin, square
 
 
 def _from_datum(solved: Solved, v: Array) -> Array:
@@ -91,12 +87,3 @@ def _over_points(
 
     found: Array = rows(error) @ push + rows(pushed) @ place
     return found.reshape(*found.shape[:-2], -1, 3, 4)
-
-
-def _of_cameras(rig: ShortRig, near: Array, centers: Array) -> Array:
-    center = centers[..., :3] + 2 * rig.offset * centers[..., 3:]
-    position = -(np.swapaxes(rig.inverse, -1, -2) @ center[..., None])
-    last = near[..., 3:]
-    rows = near[..., :3] + last * rig.datum[..., None, :] + position * rig.centers[..., None, :]
-    found = np.concatenate([rows, last + position], axis=-1)
-    return np.where(rig.finite[..., None, None], found, 0.0)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import ShapeError, check_index, check_shapes
+from deltas_geom.checks import ShapeError, check_shapes
 
 _OBSERVATIONS = 2**14  # at a time, padding included: what lies between stays in the cache
 _DIMS = {
@@ -56,7 +56,6 @@ def check_tracks(
     named = {"proj": proj, **others, **indices, "weights": weights}
     lists = {name: (x, _DIMS[name]) for name, x in named.items() if x is not None}
     check_shapes(**lists)
-    check_index(**indices)
     # A list has no batch: cameras and points of all scenes may share one list instead.
     for name, (tensor, dims) in lists.items():
         if tensor.dim() != len(dims.split()):

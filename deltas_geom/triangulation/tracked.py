@@ -4,6 +4,7 @@ Each group is a batch of points with cameras of their own (track_groups.py). Gro
 indices lead: unlike triangulate_tracks, these functions have no graph that compilers could keep.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -75,20 +76,12 @@ def triangulate_robust_tracks(
     check_tracks(proj, camera_index, point_index, weights, pixels=pixels, num_points=num_points)
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     groups = grouped(camera_index, point_index, len(proj), num_points)
-    found = []
+    robust = partial(
+        triangulate_robust, threshold=threshold, min_inliers=min_inliers, max_pairs=max_pairs
+    )
     with torch.no_grad():
-        for group in groups.groups:
-            cameras, weight, seen = seen_by(group, proj, camera_index, weights, pixels)
-            found.append(
-                triangulate_robust(
-                    cameras,
-                    seen,
-                    weight,
-                    threshold=threshold,
-                    min_inliers=min_inliers,
-                    max_pairs=max_pairs,
-                )
-            )
+        seen = (seen_by(group, proj, camera_index, weights, pixels) for group in groups.groups)
+        found = [robust(cameras, xy, weight) for cameras, weight, xy in seen]
         inliers = groups.observations([one.inliers.squeeze(-1) for one in found])
         reason = groups.points([one.status.squeeze(-1) for one in found])
         agreed = groups.points([one.inliers.squeeze(-1).any(dim=-1) for one in found])
@@ -148,22 +141,12 @@ def refine_tracks(
     check_tracks(proj, camera_index, point_index, weights, pixels=pixels, points=points)
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     groups = grouped(camera_index, point_index, len(proj), len(points))
+    refined = partial(refine_points, steps=steps, loss=loss, scale=scale, gradient=gradient)
     found = []
     for group in groups.groups:
         cameras, weight, seen = seen_by(group, proj, camera_index, weights, pixels)
         start = points.index_select(0, group.points).unsqueeze(-2)
-        found.append(
-            refine_points(
-                cameras,
-                seen,
-                start,
-                weight,
-                steps=steps,
-                loss=loss,
-                scale=scale,
-                gradient=gradient,
-            )
-        )
+        found.append(refined(cameras, seen, start, weight))
     return Refined(
         *(groups.points([part.squeeze(1) for part in parts]) for parts in zip(*found, strict=True))
     )

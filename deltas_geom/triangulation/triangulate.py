@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
-from deltas_geom.numerics.evaluation import Function, WithAdjoint, recomputed, transformed
+from deltas_geom.numerics.evaluation import Adjoint, Function, recomputed, transformed
 from deltas_geom.triangulation.equations import FRAMES, Frame, Rig, check_settings, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
@@ -141,7 +141,7 @@ class Call:
         if frame not in FRAMES:
             check_settings(frame)
         proj = known.proj
-        self.batch = check_observed(proj, pixels, weights, mask)
+        self.batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask)
         self.tensors: tuple[Any, ...] = (proj, pixels, weights, mask)
         self.known, self.frame, self.dtype = known, frame, proj.dtype
         self.alike = weights is None and mask is None
@@ -177,8 +177,10 @@ class Call:
             found = self.way.adjoint(gradients[0], needed, *tensors[1:])
             return (*map(_shaped_as, found, tensors), None)
 
-        rule = WithAdjoint(derivable, adjoint)
-        return self._computed(rule, lambda _, *seen: self.way.points(*seen), (-2,))[0]
+        def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
+            return self.way.points(*seen)
+
+        return self._computed(derivable, values, (-2,), adjoint)[0]
 
     def full(self, *, covariance: bool) -> Triangulation:
         """Points with all that is known about them."""
@@ -198,10 +200,14 @@ class Call:
         return Triangulation(points, depth, status, ok(status), residual, angle, cov, errors)
 
     def _computed(
-        self, function: Function, values: Function, outputs: tuple[int, ...]
+        self,
+        function: Function,
+        values: Function,
+        outputs: tuple[int, ...],
+        adjoint: Adjoint | None = None,
     ) -> tuple[Tensor, ...]:
         cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs)
-        return recomputed(function, *self.tensors, values=values, cut=cut)
+        return recomputed(function, *self.tensors, values=values, cut=cut, adjoint=adjoint)
 
 
 def _shaped_as(gradient: Tensor | None, tensor: Tensor | None) -> Tensor | None:

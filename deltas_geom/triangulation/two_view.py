@@ -10,16 +10,15 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.checks import check_batch, check_bool
+from deltas_geom.checks import check_batch
 from deltas_geom.epipolar.fundamental import cross_matrix
 from deltas_geom.numerics.arithmetic import only, without_autocast
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3, dot
 from deltas_geom.records import Record
 from deltas_geom.status import Status
-from deltas_geom.triangulation.correction import correction
 from deltas_geom.triangulation.judge import judge
-from deltas_geom.triangulation.observed import clean_pixels, finite_cameras, inverted
+from deltas_geom.triangulation.observed import Cameras, cameras_of, clean_pixels
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import reproject
 from deltas_geom.triangulation.results import beyond, within_residual, without
@@ -106,7 +105,6 @@ def triangulate_two_view(
         (tensor([[0.2000, 0.0000, 2.0000]]), tensor([2.]))
     """
     check_batch(proj=(proj, "2 3 4"), pixels=(pixels, "2 N 2"), mask=(mask, "2 N"))
-    check_bool(mask=mask)
     return operation(
         TwoViewTriangulation,
         (proj, pixels, mask),
@@ -120,60 +118,44 @@ def triangulate_two_view(
     )
 
 
-class _Rig(NamedTuple):
-    """Two cameras.
-
-    Attributes:
-        fundamental: ``(*B, 3, 3)`` with x1^T F x2 = 0 and largest entry 1; 0 if there is none.
-        world_from_pixel: ``(*B, 2, 3, 3)`` directions of depth 1, from homogeneous pixels.
-        centers: ``(*B, 2, 3)``; equal if a camera is singular.
-    """
-
-    fundamental: Tensor
-    world_from_pixel: Tensor
-    centers: Tensor
-
-
-def _rig(proj: Tensor) -> _Rig:
-    """Source: Hartley and Zisserman, 2nd ed., sections 6.2.4 and 9.2.2."""
-    inverse, regular = inverted(proj[..., :3])
-    centers = -(inverse @ proj[..., 3:]).squeeze(-1) * regular[..., 0].all(dim=-2, keepdim=True)
-    baseline = cross_matrix(centers.diff(dim=-2).squeeze(-2))
-    fundamental = inverse[..., 0, :, :].mT @ baseline @ inverse[..., 1, :, :]
-    largest = fundamental.detach().abs().amax(dim=(-2, -1), keepdim=True)
-    exists = (largest > 0) & largest.isfinite()
-    return _Rig(safe_divide(fundamental, largest, exists), inverse, centers)
-
-
 class _Seen(NamedTuple):
     """The inputs in the solver's type, broadcast, with everything unusable replaced.
 
     Attributes:
-        rig: of the cameras, those that are not finite replaced by 0.
+        cameras: those that are not finite replaced by 0.
+        fundamental: ``(*B, 3, 3)`` with x1^T F x2 = 0 and largest entry 1; 0 if there is none.
         xy: ``(*B, 2, 2, N)`` px, 0 where unused or not finite.
         finite: ``(*B, N)`` bool: everything used is.
         enough: ``(*B, N)`` bool: both views are used.
-        proj: ``(*B, 2, 3, 4)`` those cameras.
         dtype: of the inputs.
     """
 
-    rig: _Rig
+    cameras: Cameras
+    fundamental: Tensor
     xy: Tensor
     finite: Tensor
     enough: Tensor
-    proj: Tensor
     dtype: torch.dtype
 
 
 def _see(proj: Tensor, pixels: Tensor, mask: Tensor | None) -> _Seen:
     x, y, sound = clean_pixels(pixels)
     used = torch.ones_like(x, dtype=torch.bool) if mask is None else mask
-    camera, broken = finite_cameras(proj)
-    finite = only((broken == 0).unsqueeze(-1), sound, other=False)
+    cameras = cameras_of(proj)
+    finite = only((cameras.broken == 0).unsqueeze(-1), sound, other=False)
     xy = torch.where((finite & used).unsqueeze(-2), torch.stack([x, y], dim=-2), 0.0)
     known, enough = (finite | ~used).all(dim=-2), used.all(dim=-2)
     dtype = torch.promote_types(proj.dtype, pixels.dtype)
-    return _Seen(_rig(camera), xy, known, enough, camera, dtype)
+    return _Seen(cameras, _fundamental(cameras), xy, known, enough, dtype)
+
+
+def _fundamental(cameras: Cameras) -> Tensor:
+    """Source: Hartley and Zisserman, 2nd ed., section 9.2.2."""
+    first, second = cameras.inverse.unbind(dim=-3)
+    baseline = cross_matrix(cameras.centers.diff(dim=-2).squeeze(-2))
+    fundamental = first.mT @ baseline @ second
+    largest = fundamental.detach().abs().amax(dim=(-2, -1), keepdim=True)
+    return safe_divide(fundamental, largest, (largest > 0) & largest.isfinite())
 
 
 class _Solved(NamedTuple):
@@ -198,40 +180,78 @@ class _Solved(NamedTuple):
 
 def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     """Points of pixels. What is not ``valid``, if given, passes no gradient and no NaN."""
-
-    def safe(divisor: Tensor) -> Tensor:
-        return torch.where(divisor > torch.finfo(divisor.dtype).tiny ** 0.4, divisor, 1.0)
-
-    rig = seen.rig
+    inverse, centers = seen.cameras.inverse, seen.cameras.centers
     xy = seen.xy if valid is None else torch.where(valid[..., None, None, :], seen.xy, 0.0)
-    shift = correction(rig.fundamental, xy, safe)
-    inverse = rig.world_from_pixel
+    shift = _correction(seen.fundamental, xy)
     ray = product(inverse[..., :2], xy - shift) + inverse[..., 2:]
-    size = safe(ray.detach().abs().amax(dim=-2))
+    size = _safe(ray.detach().abs().amax(dim=-2))
     ray = ray / size.unsqueeze(-2)
     # By components, which costs half of torch.linalg.cross and its gradient.
     first, second = (one.unbind(dim=-2) for one in ray.unbind(dim=-3))
-    baseline = rig.centers.diff(dim=-2).mT.unbind(dim=-2)
+    baseline = centers.diff(dim=-2).mT.unbind(dim=-2)
     across = _cross(first, second)
     passing = _cross(baseline, second), _cross(baseline, first)
     squared = dot(across, across)
     along = torch.stack([dot(one, across) for one in passing], dim=-2)
-    along = along / safe(squared).unsqueeze(-2)
+    along = along / _safe(squared).unsqueeze(-2)
     # From both cameras, so that their order does not count.
-    points = (rig.centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
+    points = (centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
     with torch.no_grad():
         beside = torch.stack([safe_sqrt(dot(one, one)) for one in passing], dim=-2)
         length, cosine = safe_sqrt(squared), dot(first, second)
-        sine = length * safe(squared + cosine * cosine).rsqrt()
+        sine = length * _safe(squared + cosine * cosine).rsqrt()
         parallax = torch.atan2(length, cosine)
     return _Solved(points, shift, along / size, parallax, sine, beside)
 
 
+def _correction(fundamental: Tensor, xy: Tensor) -> Tensor:
+    """What to take from pixels ``(*B, 2, 2, N)`` so that the rays of each pair meet, px."""
+    x1, x2 = xy.unbind(dim=-3)
+    # Normals of the epipolar lines, and the epipolar error.
+    a1, b1, last = (product(fundamental[..., :2], x2) + fundamental[..., 2:]).unbind(dim=-2)
+    back = fundamental[..., :2].mT
+    a2, b2 = (product(back[..., :2], x1) + back[..., 2:]).unbind(dim=-2)
+    error = a1 * x1[..., 0, :] + b1 * x1[..., 1, :] + last
+    # In units of the longer normal all that follows is in pixels, near the epipoles too.
+    share = 1 / _safe(torch.stack([a1, b1, a2, b2]).detach().abs().amax(dim=0))
+    a1, b1, a2, b2, error = (value * share for value in (a1, b1, a2, b2, error))
+    f00, f01, f10, f11 = (fundamental[..., i, j, None] * share for i in (0, 1) for j in (0, 1))
+
+    # The pair that moves by k times its normals meets where error - 2 half k + curve k^2 = 0.
+    da1, db1 = f00 * a2 + f01 * b2, f10 * a2 + f11 * b2
+    da2, db2 = f00 * a1 + f10 * b1, f01 * a1 + f11 * b1
+    curve = a1 * da1 + b1 * db1
+    squared1, squared2 = a1 * a1 + b1 * b1, a2 * a2 + b2 * b2
+    half = (squared1 + squared2) / 2
+    under = half * half - curve * error
+    real = under > 0
+    root = safe_sqrt(torch.where(real, under, 1.0))
+    # Gross errors near the epipoles have no such pair: there one pixel moves to the other's line.
+    k = error / _safe(torch.where(real, half + root, torch.maximum(squared1, squared2)))
+    k1 = torch.where(real | (squared1 >= squared2), k, 0.0)
+    k2 = torch.where(real | (squared1 < squared2), k, 0.0)
+
+    # The lines through that pair correspond: the given pixels' nearest on them meet exactly.
+    def moved(k: Tensor, a: Tensor, b: Tensor, new_a: Tensor, new_b: Tensor) -> Tensor:
+        share = k * (a * new_a + b * new_b) / _safe(new_a * new_a + new_b * new_b)
+        return torch.stack([share * new_a, share * new_b], dim=-2)
+
+    first = moved(k1, a1, b1, a1 - k2 * da1, b1 - k2 * db1)
+    second = moved(k2, a2, b2, a2 - k1 * da2, b2 - k1 * db2)
+    return torch.stack([first, second], dim=-3)
+
+
+def _safe(divisor: Tensor) -> Tensor:
+    """1 in place of what is not positive, nor its square."""
+    return torch.where(divisor > torch.finfo(divisor.dtype).tiny ** 0.4, divisor, 1.0)
+
+
 def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
     """Points, and their status ``(*B, N)`` int8."""
-    rig, eps, solved = seen.rig, torch.finfo(seen.dtype).eps, _solve(seen)
-    length = rig.centers.diff(dim=-2).norm(dim=-1)
-    size = rig.centers.norm(dim=-1).amax(dim=-1)[..., None]
+    centers, eps, solved = seen.cameras.centers, torch.finfo(seen.dtype).eps, _solve(seen)
+    exist = (seen.cameras.inverse != 0).any(dim=-1).any(dim=-1).all(dim=-1, keepdim=True)
+    length = centers.diff(dim=-2).norm(dim=-1) * exist
+    size = centers.norm(dim=-1).amax(dim=-1)[..., None]
     # Centres closer together than the rounding of where they are do not differ. On the baseline
     # both rays pass the other camera within rounding.
     farther = solved.beside.amax(dim=-2)
@@ -261,8 +281,8 @@ def _describe(seen: _Seen, solved: _Solved, valid: Tensor, covariance: bool) -> 
         "errors": safe_sqrt(squared),
     }
     if covariance:
-        again = reproject(seen.proj, points.unbind(dim=-2), both.expand_as(squared))
-        noise = covariance_of(seen.proj, again, torch.ones_like(squared))
+        again = reproject(seen.cameras.proj, points.unbind(dim=-2), both.expand_as(squared))
+        noise = covariance_of(seen.cameras.proj, again, torch.ones_like(squared))
         found["covariance"] = unpacked3(noise)
     return found
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import batch_shape, check_batch, check_bool, check_shapes, check_tensor
+from deltas_geom.checks import check_tensor
 from deltas_geom.numerics.arithmetic import at_least_in_single, solver_dtype, without_autocast
 from deltas_geom.numerics.symmetric3 import inverse3
 from deltas_geom.numerics.vectors import Symmetric3, Vector3
@@ -17,7 +17,13 @@ from deltas_geom.triangulation.observed import (
     clean_points,
     finite_cameras,
 )
-from deltas_geom.triangulation.reprojection import Reprojection, parallax_of, reproject, residual_of
+from deltas_geom.triangulation.reprojection import (
+    Reprojection,
+    mean_of,
+    parallax_of,
+    reproject,
+    squared_errors,
+)
 from deltas_geom.triangulation.weights import weigh
 
 
@@ -44,18 +50,15 @@ def reprojection_residual(
         TypeError: ``proj`` is not floating point, or the mask not bool.
     """
     check_tensor(weights=weights)
-    batch = check_observed(proj, pixels, weights, mask)
-    check_shapes(pixels=(pixels, "V N 2"), points=(points, "N 3"))
-    batch = batch_shape(batch, points.shape[:-2])
+    batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask, points=points)
     (cameras, broken), (places, known) = finite_cameras(proj), clean_points(points)
     x, y, sound = clean_pixels(pixels)
     healthy = (broken == 0).unsqueeze(-1)
-    sound = (
-        healthy.expand(*healthy.shape[:-1], points.shape[-2]) if sound is None else sound & healthy
-    )
+    sound = healthy if sound is None else sound & healthy
     weighed = weigh(weights, mask, batch=batch, like=weights.unsqueeze(-1), sound=sound)
     used = ~weighed.unused & (weighed.sound & known).unsqueeze(-2)
-    residual = residual_of(reproject(cameras, places, used), x, y, weighed.squared)
+    found = reproject(cameras, places, used)
+    residual = mean_of(squared_errors(found, x, y), found.seen, weighed.squared)
     return residual.clamp(max=torch.finfo(proj.dtype).max).to(proj.dtype)
 
 
@@ -76,8 +79,7 @@ def ray_parallax(proj: Tensor, points: Tensor, used: Tensor) -> Tensor:
         ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
         TypeError: ``proj`` is not floating point, or ``used`` not bool.
     """
-    check_batch(proj=(proj, "+V 3 4"), points=(points, "N 3"), used=(used, "V N"))
-    check_bool(used=used)
+    check_observed(proj=proj, points=points, used=used)
     cameras, (places, known) = cameras_of(proj.detach()), clean_points(points.detach())
     broken = cameras.broken.unsqueeze(-1) > 0
     sound = known & ~(broken & used).any(dim=-2)
@@ -137,14 +139,9 @@ def point_covariance(
                 [ 0.,  0.,  0.]])
     """
     check_tensor(weights=weights)
-    batch = check_batch(
-        proj=(proj, "+V 3 4"),
-        points=(points, "N 3"),
-        weights=(weights, "V N"),
-        mask=(mask, "V N"),
-        pose_covariance=(pose_covariance, "V 6 6"),
+    batch = check_observed(
+        proj=proj, points=points, weights=weights, mask=mask, pose_covariance=pose_covariance
     )
-    check_bool(mask=mask)
     (cameras, broken), (places, known) = finite_cameras(proj), clean_points(points)
     work, sound, noise = cameras.dtype, broken == 0, None
     if pose_covariance is not None:
@@ -185,7 +182,7 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         tensor([[9.]])
     """
     check_tensor(covariance=covariance)  # None: it was not asked for
-    check_batch(proj=(proj, "+V 3 4"), covariance=(covariance, "N 3 3"))
+    check_observed(proj=proj, covariance=covariance)
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
     (cameras, _), work = finite_cameras(proj), solver_dtype(proj)
     finite = _fits(covariance, torch.finfo(covariance.dtype).max)

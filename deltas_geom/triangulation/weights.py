@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import solver_dtype, values_at_hand
+from deltas_geom.numerics.arithmetic import only, solver_dtype, values_at_hand
 
 NEGLIGIBLE_WEIGHT = 1e-6
 """A view whose weight is below this share of the point's largest counts as no view: its squared
@@ -99,10 +99,8 @@ def _shares(
     counted = largest <= torch.finfo(largest.dtype).max  # NaN is not, either
     largest = torch.where(counted & (largest > 0), largest, 1.0)
     # Double where: an infinite weight must not turn the gradient into NaN.
-    kept = counted if sound is None else counted & sound
-    share = torch.where(kept, weight, 0.0) / largest
-    counts = ~unused if sound is None else sound & ~unused
-    return torch.where(counts, share * share, 0.0), largest, unused, counted
+    share = only(weight, counted, sound) / largest
+    return only(share * share, ~unused, sound), largest, unused, counted
 
 
 def _all_count(size: Tensor, largest: Tensor) -> bool:

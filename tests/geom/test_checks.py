@@ -14,7 +14,6 @@ from deltas_geom.checks import (
     check_bool,
     check_depth_range,
     check_image_size,
-    check_index,
     check_shapes,
 )
 
@@ -91,10 +90,10 @@ def test_a_plus_asks_for_one_or_more() -> None:
 
 def test_masks_are_bool_and_indices_are_integers() -> None:
     check_bool(mask=None, used=torch.ones(2, dtype=torch.bool))
-    check_index(index=torch.ones(2, dtype=torch.int32))
+    check_shapes(point_index=(torch.ones(2, dtype=torch.int32), "T"))
     for wrong in (torch.ones(2), torch.ones(2, dtype=torch.int64)):
         with pytest.raises(TypeError, match="mask must be bool, True = used, got torch"):
             check_bool(mask=wrong)
     for wrong in (torch.ones(2), torch.ones(2, dtype=torch.bool)):
-        with pytest.raises(TypeError, match="index must hold integers, got torch"):
-            check_index(index=wrong)
+        with pytest.raises(TypeError, match="point_index must hold integers, got torch"):
+            check_shapes(point_index=(wrong, "T"))

@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom.numerics.ldl import multiply
-from deltas_geom.numerics.null_vector import NullVector, null_vector, rayleigh_step
-from deltas_geom.numerics.proof import proved_vector
+from deltas_geom.numerics.null_vector import NullVector, null_vector, proved_vector, rayleigh_step
 from deltas_geom.numerics.vectors import Symmetric4, Vector4, dot, unit
 from deltas_geom.testing.strategies import vectors
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom.numerics.chunks import Cut
-from deltas_geom.numerics.evaluation import WithAdjoint, recomputed
+from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.testing.strategies import vectors
 
 
@@ -242,7 +242,7 @@ def test_an_adjoint_gives_the_gradient_in_place_of_the_function(
     x, y = leaves(numbers)
 
     def solve(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        return recomputed(WithAdjoint(root, implicit), x, y, cut=cut)
+        return recomputed(root, x, y, cut=cut, adjoint=implicit)
 
     found = (torch.compile(solve, fullgraph=True, backend="aot_eager") if compiled else solve)(x, y)
     assert [out.requires_grad for out in found] == [True, False, False]
@@ -268,13 +268,12 @@ def test_an_adjoint_spares_the_function_except_where_more_is_asked() -> None:
         return implicit(*arguments)
 
     x, y = leaves(torch.tensor([[0.5, 1.0], [1.0, 1.5]]).double())
-    both = WithAdjoint(function, adjoint)
     kept: list[Tensor] = []
     with torch.autograd.graph.saved_tensors_hooks(
         lambda tensor: kept.append(tensor) or tensor,
         lambda tensor: tensor,
     ):
-        found = recomputed(both, x, y, values=root)[0]
+        found = recomputed(function, x, y, values=root, adjoint=adjoint)[0]
     assert len(kept) == 2  # the inputs
     found.sum().backward(retain_graph=True)
     assert calls == ["adjoint"]
@@ -283,4 +282,6 @@ def test_an_adjoint_spares_the_function_except_where_more_is_asked() -> None:
     assert calls[1:] == ["function"]
     assert x.grad is not None
     assert_close(rows, torch.diag(x.grad))
-    assert torch.autograd.gradgradcheck(lambda x, y: recomputed(both, x, y)[0], (x, y))
+    assert torch.autograd.gradgradcheck(
+        lambda x, y: recomputed(function, x, y, adjoint=adjoint)[0], (x, y)
+    )

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.lenses import closed
 from deltas_geom.cameras.lenses.closed import Coefficients, Direction, Seen
-from deltas_geom.cameras.lenses.polynomial import Polynomial, prism_of_aria
+from deltas_geom.cameras.lenses.polynomial import Polynomial
 
 
 class Model(NamedTuple):
@@ -60,17 +60,18 @@ def _closed(
     )
 
 
-def _polynomial(names: str, focals: int, kind: Polynomial) -> Model:
+def _distorted(names: str, focals: int, kind: Polynomial) -> Model:
     parts = (kind.pixels, kind.rays, kind.reach, kind.around_axis)
-    return Model(tuple(names.split()), focals, *parts)
+    undone = kind.undone if kind.steps[1:] else None
+    return Model(tuple(names.split()), focals, *parts, undone)
 
 
 def _slopes(names: str, focals: int = 2, /, **kinds: str) -> Model:
-    return _polynomial(names, focals, Polynomial.named(names, angles=False, **kinds))
+    return _distorted(names, focals, Polynomial.named(names, kinds, angles=False))
 
 
-def _angles(names: str, focals: int = 2, /, **kinds: str) -> Model:
-    return _polynomial(names, focals, Polynomial.named(names, angles=True, **kinds))
+def _angles(names: str, focals: int = 2, /, *later: dict[str, str], **kinds: str) -> Model:
+    return _distorted(names, focals, Polynomial.named(names, kinds, *later, angles=True))
 
 
 _RATIONAL = "k1 k2 p1 p2 k3 k4 k5 k6"
@@ -100,13 +101,12 @@ MODELS: dict[str, Model] = {
         tangential=_TANGENTIAL,
         prism="sx1 sy1",
     ),
-    "RAD_TAN_THIN_PRISM_FISHEYE": Model(
-        ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+    # Source: https://facebookresearch.github.io/projectaria_tools, "Fisheye624".
+    "RAD_TAN_THIN_PRISM_FISHEYE": _angles(
+        "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
         2,
-        prism_of_aria.pixels,
-        prism_of_aria.rays,
-        prism_of_aria.reach,
-        undone=prism_of_aria.undone,
+        {"tangential": "p0 p1", "prism": "s0 s2 s1 s3"},
+        radial="k0 k1 k2 k3 k4 k5",
     ),
     "EQUIRECTANGULAR": _closed("", 2, closed.panorama_pixels, closed.panorama_rays),
 }

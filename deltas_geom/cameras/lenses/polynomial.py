@@ -1,6 +1,7 @@
 """Models that distort by a polynomial: where points of the camera's frame appear, and rays."""
 
 import math
+from functools import reduce
 from typing import NamedTuple, Self
 
 import torch
@@ -13,104 +14,87 @@ from deltas_geom.cameras.lenses.terms import Terms, distort, one_to_one_within
 from deltas_geom.numerics.arithmetic import only, unless_all
 
 
-class Polynomial(NamedTuple):
-    """Which coefficients are which terms of a distortion of slopes, or of angles.
+class Places(NamedTuple):
+    """Which coefficients are which terms of a distortion.
 
     Attributes:
-        angles: is it the angle from the axis that is distorted (fisheye), not its tangent?
         radial: places of coefficients of r^2, r^4, ... in the numerator.
         divided: in the denominator.
         tangential: x and y.
         prism: x and y of r^2, then perhaps x and y of r^4.
     """
 
-    angles: bool
     radial: tuple[int, ...] = ()
     divided: tuple[int, ...] = ()
     tangential: tuple[int, ...] = ()
     prism: tuple[int, ...] = ()
 
+    def terms(self, coefficients: Coefficients) -> Terms:
+        """The terms of these coefficients."""
+        return Terms(*(tuple(coefficients[k] for k in places) for places in self))
+
+
+class Polynomial(NamedTuple):
+    """One distortion of slopes, or of angles, after the other.
+
+    Attributes:
+        angles: is it the angle from the axis that is distorted (fisheye), not its tangent?
+        steps: each of what the one before it gave.
+    """
+
+    angles: bool
+    steps: tuple[Places, ...]
+
     @classmethod
-    def named(cls, names: str, *, angles: bool, **kinds: str) -> Self:
+    def named(cls, names: str, *steps: dict[str, str], angles: bool) -> Self:
         """With the names of coefficients in place of their places among ``names``."""
         place = {name: k for k, name in enumerate(names.split())}
-        return cls(
-            angles, **{kind: tuple(place[n] for n in of.split()) for kind, of in kinds.items()}
-        )
+
+        def placed(step: dict[str, str]) -> Places:
+            return Places(
+                **{kind: tuple(place[n] for n in of.split()) for kind, of in step.items()}
+            )
+
+        return cls(angles, tuple(map(placed, steps)))
 
     @property
     def around_axis(self) -> bool:
-        """As :attr:`Model.around_axis`."""
-        return not self.tangential and not self.prism
-
-    def terms(self, coefficients: Coefficients) -> Terms:
-        """The terms of these coefficients."""
-        parts = [tuple(coefficients[k] for k in places) for places in self[1:]]
-        return Terms(*parts)
+        """As :attr:`Model.around_axis`, which asks the first step alone."""
+        return not (self.steps[0].tangential or self.steps[0].prism)
 
     def reach(self, coefficients: Coefficients) -> Tensor:
-        """How far from the axis the model is one to one, ``(*B, 1)``."""
-        return one_to_one_within(self.terms(coefficients), math.pi if self.angles else math.inf)
+        """How far from the axis each step is one to one, ``(*B, steps)``."""
+        first, *others = (step.terms(coefficients) for step in self.steps)
+        ends = [one_to_one_within(first, math.pi if self.angles else math.inf)]
+        return torch.cat([*ends, *map(one_to_one_within, others)], dim=-1)
 
     def pixels(
         self, coefficients: Coefficients, reach: Tensor, x: Tensor, y: Tensor, z: Tensor
     ) -> Seen:
         """As :attr:`Model.pixels`."""
-        x, y, ahead = _angles(x, y, z) if self.angles else slopes(x, y, z)
-        seen = ahead & (torch.addcmul(x * x, y, y) < reach * reach)
-        known = unless_all(seen)
-        u, v = distort(self.terms(coefficients), only(x, known), only(y, known))
-        return u, v, seen
+        x, y, seen = _angles(x, y, z) if self.angles else slopes(x, y, z)
+        for step, end in zip(self.steps, torch.split(reach, 1, dim=-1), strict=True):
+            seen = seen & (torch.addcmul(x * x, y, y) < end * end)
+            known = unless_all(seen)
+            x, y = distort(step.terms(coefficients), only(x, known), only(y, known))
+        return x, y, seen
 
     def rays(
         self, coefficients: Coefficients, reach: Tensor, u: Tensor, v: Tensor, derivable: bool
     ) -> Direction:
         """As :attr:`Model.rays`."""
-        x, y, found = _plane(self.terms(coefficients), reach, u, v, derivable)
-        return (*(_from_angles(x, y) if self.angles else _from_slopes(x, y)), found)
-
-
-class _Aria(NamedTuple):
-    """A radial distortion of angles, and after it a tangential and a prism's: Aria's cameras.
-
-    Source: https://facebookresearch.github.io/projectaria_tools, "Fisheye624".
-    """
-
-    first: Polynomial
-    second: Polynomial
-
-    def reach(self, coefficients: Coefficients) -> Tensor:
-        """That of each step, ``(*B, 2)``."""
-        parts = self.first.reach(coefficients), self.second.reach(coefficients)
-        return torch.cat(parts, dim=-1)
-
-    def pixels(
-        self, coefficients: Coefficients, reach: Tensor, x: Tensor, y: Tensor, z: Tensor
-    ) -> Seen:
-        """As :attr:`Model.pixels`."""
-        x, y, seen = self.first.pixels(coefficients, reach[..., :1], x, y, z)
-        seen = seen & (torch.addcmul(x * x, y, y) < reach[..., 1:].square())
-        known = unless_all(seen)
-        u, v = distort(self.second.terms(coefficients), only(x, known), only(y, known))
-        return u, v, seen
-
-    def rays(
-        self, coefficients: Coefficients, reach: Tensor, u: Tensor, v: Tensor, derivable: bool
-    ) -> Direction:
-        """As :attr:`Model.rays`."""
-        return self.first.rays(coefficients, reach[..., :1], u, v, derivable)
+        u, v, found = _plane(self.steps[0].terms(coefficients), reach[..., :1], u, v, derivable)
+        return (*(_from_angles(u, v) if self.angles else _from_slopes(u, v)), found)
 
     def undone(
         self, coefficients: Coefficients, reach: Tensor, u: Tensor, v: Tensor, derivable: bool
     ) -> Seen:
-        """As :attr:`Model.undone`."""
-        return _plane(self.second.terms(coefficients), reach[..., 1:], u, v, derivable)
-
-
-prism_of_aria = _Aria(
-    Polynomial(angles=True, radial=(0, 1, 2, 3, 4, 5)),
-    Polynomial(angles=False, tangential=(6, 7), prism=(8, 10, 9, 11)),
-)
+        """As :attr:`Model.undone`: all steps but the first."""
+        masks = []
+        for step, end in zip(self.steps[:0:-1], torch.split(reach, 1, dim=-1)[:0:-1], strict=True):
+            u, v, within = _plane(step.terms(coefficients), end, u, v, derivable)
+            masks.append(within)
+        return u, v, reduce(torch.logical_and, masks)
 
 
 def _plane(terms: Terms, reach: Tensor, u: Tensor, v: Tensor, derivable: bool) -> Seen:

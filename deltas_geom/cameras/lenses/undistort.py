@@ -5,17 +5,15 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.lenses.lens import Lens, LensPixels
-from deltas_geom.cameras.pixels import in_image, normalize_pixels, pixel_grid
+from deltas_geom.cameras.pixels import in_image, pixel_grid, read_map
 from deltas_geom.cameras.projection import pixel_rays
 from deltas_geom.checks import ShapeError, batch_shape, check_image_size, check_kind, check_shapes
 from deltas_geom.numerics.arithmetic import (
     finite_or_zero,
-    numbers_or_zero,
     only,
     surely_all,
     unless_all,
@@ -161,18 +159,7 @@ def _remapped(
     )
     pixels, valid = lens.project(pixel_rays(new_K, grid))
     valid = valid & in_image(pixels.detach(), image_size=old_size)
-    places = normalize_pixels(pixels, image_size=old_size).to(image.dtype)
-    places = places.expand(*batch, *places.shape[-2:])
-    read = F.grid_sample(
-        # The count, not -1: a reshape of nothing cannot infer it.
-        numbers_or_zero(image)
-        .expand(*batch, *image.shape[-3:])
-        .reshape(batch.numel(), *image.shape[-3:]),
-        places.reshape(batch.numel(), *new_size, 2),
-        mode,
-        padding_mode="border",
-        align_corners=False,
-    )
+    read = read_map(image, pixels, image_size=old_size, mode=mode)
     mask = valid.expand(*batch, valid.shape[-1]).reshape(*batch, 1, *new_size)
     image = read.reshape(*batch, image.shape[-3], *new_size)
     new_K, _ = finite_or_zero(new_K, dims=2)
