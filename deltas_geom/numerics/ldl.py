@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.numerics.symmetric3 import substituted3
-from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, less
+from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, less, scaled
 
 
 def rounding(matrix: Symmetric4) -> Tensor:
@@ -60,6 +60,18 @@ class Pivots(NamedTuple):
     l32: Tensor
 
 
+class Factors(NamedTuple):
+    """LDL^T, to solve with.
+
+    Attributes:
+        pivots: LDL^T.
+        scales: the last pivot by each of the others.
+    """
+
+    pivots: Pivots
+    scales: Vector3
+
+
 def eliminate(matrix: Symmetric4) -> Pivots:
     """LDL^T of matrices, the last coordinate eliminated last."""
     m00, m01, m02, m03, m11, m12, m13, m22, m23, m33 = matrix
@@ -75,31 +87,37 @@ def eliminate(matrix: Symmetric4) -> Pivots:
     return Pivots(i0, i1, i2, d3, l10, l20, l30, l21, l31, l32)
 
 
+def factor(matrix: Symmetric4) -> Factors:
+    """The same, to solve with."""
+    pivots = eliminate(matrix)
+    return Factors(pivots, scaled(pivots[:3], pivots.d3))
+
+
 def solve_leading(f: Pivots, b: Vector3) -> Vector3:
     """A^-1 b, A the leading 3x3 block."""
     return substituted3((f.i0, f.i1, f.i2, f.l10, f.l20, f.l21), b)
 
 
-def solve_scaled(f: Pivots, b: Vector4) -> Vector4:
+def solve_scaled(factors: Factors, b: Vector4) -> Vector4:
     """The last pivot times M^-1 b: the pivot that vanishes is never divided by."""
+    f, (s0, s1, s2) = factors
     b0, b1, b2, b3 = b
     b1 = less(b1, f.l10, b0)
     b2 = less(less(b2, f.l20, b0), f.l21, b1)
     b3 = less(less(less(b3, f.l30, b0), f.l31, b1), f.l32, b2)
-    return _back(f, (b0, b1, b2), b3)
+    return _back(f, b0 * s0, b1 * s1, b2 * s2, b3)
 
 
-def start(f: Pivots) -> Vector4:
+def start(factors: Factors) -> Vector4:
     """The same for a b of which L^-1 b is constant: nearly M^-1 e4, the inhomogeneous solution.
 
     The other components reach vectors near infinity, to which e4 is nearly orthogonal.
     """
-    constant = tuple(f.d3.new_full((), share) for share in (0.13, 0.07, 0.11))
-    return _back(f, constant, torch.ones_like(f.d3))
+    f, (s0, s1, s2) = factors
+    return _back(f, 0.13 * s0, 0.07 * s1, 0.11 * s2, torch.ones_like(f.d3))
 
 
-def _back(f: Pivots, b: Vector3, z3: Tensor) -> Vector4:
-    z0, z1, z2 = (each * (inverse * f.d3) for each, inverse in zip(b, f[:3], strict=True))
+def _back(f: Pivots, z0: Tensor, z1: Tensor, z2: Tensor, z3: Tensor) -> Vector4:
     z2 = less(z2, f.l32, z3)
     z1 = less(less(z1, f.l21, z2), f.l31, z3)
     z0 = less(less(less(z0, f.l10, z1), f.l20, z2), f.l30, z3)

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
 from deltas_geom.numerics.ldl import (
-    Pivots,
+    Factors,
     eliminate,
+    factor,
     multiply,
     rounding,
     rounding_of,
@@ -133,23 +134,24 @@ def _iterated(
 ) -> NullVector:
     noise = rounding(matrix)
     # Above the null space by the rounding of M, every pivot is positive.
-    f = eliminate(shifted(matrix, -noise))
-    x = start(f)
+    factors = factor(shifted(matrix, -noise))
+    x = start(factors)
     for _ in range(_INVERSE_ITERATIONS - 1):
-        x = solve_scaled(f, x)
+        x = solve_scaled(factors, x)
     x = unit(x)  # before it overflows: towards infinity each solve makes it longer
-    near = solve_scaled(f, x)
+    near = solve_scaled(factors, x)
     length = dot(near, near)
-    quotient = f.d3 * dot(near, x) / length - noise
+    quotient = factors.pivots.d3 * dot(near, x) / length - noise
     near, quotient = _nearer(matrix, scaled(near, length.rsqrt()), quotient, noise)
 
     # Just above one eigenvalue, one pivot is negative (Sylvester's law of inertia).
-    f = eliminate(shifted(matrix, quotient + noise))
-    simple = f.i0.sign() + f.i1.sign() + f.i2.sign() + f.d3.sign() == 2
-    vector = solve_scaled(f, near)
+    factors = factor(shifted(matrix, quotient + noise))
+    p = factors.pivots
+    simple = p.i0.sign() + p.i1.sign() + p.i2.sign() + p.d3.sign() == 2
+    vector = solve_scaled(factors, near)
     if product is not None:
         for _ in range(polish):
-            vector = _polished(f, unit(vector), product)
+            vector = _polished(factors, unit(vector), product)
     return NullVector(vector, simple)
 
 
@@ -173,13 +175,13 @@ def _nearer(
     """
     # Off the quotient itself, where a pivot of a simple matrix may vanish exactly.
     below = -0.4 * noise
-    f = eliminate(shifted(matrix, quotient - below))
+    factors = factor(shifted(matrix, quotient - below))
     same = 256 * torch.finfo(noise.dtype).eps
-    b = solve_scaled(f, a)  # K b = d3 a with K = M - shift, and a^T K a = below
+    b = solve_scaled(factors, a)  # K b = d3 a with K = M - shift, and a^T K a = below
     along, length = dot(a, b), dot(b, b)
     across = less(length, along, along)
     # K in the plane, times across: below * across, g * sqrt(across), -along * g.
-    g = less(f.d3, below, along)
+    g = less(factors.pivots.d3, below, along)
     half = 0.5 * torch.addcmul(below * across, along, g)
     step = half + torch.addcmul(half * half, g * g, across).clamp(min=0).sqrt()
     # Where both are one, or both quotients, within rounding, the iteration has converged.
@@ -188,17 +190,17 @@ def _nearer(
     of_a = torch.where(flat, zero, torch.addcmul(g * across, step, along))
     of_b = torch.where(flat, one, -step)
     nearer = plus(scaled(a, of_a), of_b, b)
-    change = torch.where(flat, below - f.d3 * along / length, step / across)
+    change = torch.where(flat, below - factors.pivots.d3 * along / length, step / across)
     return nearer, quotient - change
 
 
-def _polished(f: Pivots, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
+def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4]) -> Vector4:
     """x - (M - mu)^+ (M x - mu x), mu = x^T M x: Newton's method in the complement of x."""
     image = product(x)
     mu = dot(x, image)
-    change = solve_scaled(f, minus(image, mu, x))
+    change = solve_scaled(factors, minus(image, mu, x))
     # What the solve amplifies is along x, and goes.
-    return minus(x, f.d3.reciprocal(), minus(change, dot(x, change), x))
+    return minus(x, factors.pivots.d3.reciprocal(), minus(change, dot(x, change), x))
 
 
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
