@@ -1,5 +1,6 @@
 """Small text files that people write: a few words on each line, and comments."""
 
+import codecs
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,22 @@ def in_commas(words: str) -> str:
     return " (decimal commas: write 0.5, not 0,5)" if found else ""
 
 
+def decoded(data: bytes) -> str:
+    """The text of a file: UTF-8, or UTF-16 where its first bytes say so.
+
+    Spreadsheets ("Unicode text") and PowerShell (what ``>`` writes) make the latter.
+
+    Raises:
+        UnicodeDecodeError: it is neither.
+
+    Example:
+        >>> decoded("fx: 9".encode("utf-16"))
+        'fx: 9'
+    """
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig")
+
+
 def read_text(path: Path, *, name: str, remedy: str) -> str:
     """A text file within bounds.
 
@@ -37,7 +54,7 @@ def read_text(path: Path, *, name: str, remedy: str) -> str:
         if size > TEXT_LIMIT or not path.is_file():
             what = f"the {name} is no text file of less than {TEXT_LIMIT // 2**20} MiB"
             raise UserError(what, path, remedy)
-        return path.read_text(encoding="utf-8-sig")
+        return decoded(path.read_bytes())
     except OSError as error:
         what = f"the {name} cannot be read ({error.strerror or error})"
         raise UserError(what, path, remedy) from error
