@@ -54,7 +54,7 @@ def read_text(path: Path, *, name: str, remedy: str) -> str:
         if size > TEXT_LIMIT or not path.is_file():
             what = f"the {name} is no text file of less than {TEXT_LIMIT // 2**20} MiB"
             raise UserError(what, path, remedy)
-        return decoded(path.read_bytes())
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         what = f"the {name} cannot be read ({error.strerror or error})"
         raise UserError(what, path, remedy) from error
