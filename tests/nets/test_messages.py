@@ -66,7 +66,7 @@ COMMANDS = (
     "evaluate CAPTURE --offset 2",
     "evaluate CAPTURE --predictions empty",
     "evaluate BLIND",
-    "evaluate CAPTURE --depth-range 500 1000",
+    "evaluate CAPTURE --depth-range 3 9",
     "evaluate --rooms 1 --conditions foo",
     "evaluate nowhere --json OUT/s.json",
     "detectors",
