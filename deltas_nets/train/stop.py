@@ -2,6 +2,8 @@
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -20,6 +22,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.made = False
+        self._waits = True
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -32,8 +35,26 @@ class StopRequest:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
+    @contextmanager
+    def obeyed_at_once(self) -> Iterator[None]:
+        """Inside, where nothing is lost if it is left undone, a request is not made to wait.
+
+        Raises:
+            KeyboardInterrupt: it is made, or was made before.
+        """
+        if self.made:
+            raise KeyboardInterrupt
+        self._waits = False
+        try:
+            yield
+        finally:
+            self._waits = True
+
     def _notice(self, number: int, frame: FrameType | None) -> None:
         # torchrun answers Ctrl-C with SIGTERM on top: that is the same request, not a second one.
-        if self.made and number == signal.SIGINT:
-            raise KeyboardInterrupt
+        again = self.made and number == signal.SIGINT
         self.made = True
+        if again or not self._waits:
+            # Once is enough: what is printed and closed on the way out is not torn apart.
+            self._waits = True
+            raise KeyboardInterrupt
