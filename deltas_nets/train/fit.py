@@ -94,7 +94,8 @@ def fit(
         remove_half_written(folder)
     save()  # before the first step, so that a run can always be resumed
     failures = 0
-    with StopRequest() as request, _log(fabric, folder, config, step, report) as log:
+    log_of_run = _log(fabric, folder, config, step, report)
+    with StopRequest(tells=fabric.is_global_zero) as request, log_of_run as log:
 
         def validate_at(step: int) -> None:
             if step == 0 or (step % validate_every and step != last) or log.validated(step):

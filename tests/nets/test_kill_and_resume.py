@@ -60,6 +60,7 @@ def test_a_signal_to_the_whole_group_ends_it_between_two_steps(
     said = finish(launch(stopped, ahead, "stop-all"), code=-signal.SIGINT)
     assert "KeyboardInterrupt" in said
     assert "exited unexpectedly" not in said
+    assert said.count("stopping after this step") == 1
     assert read_checkpoint(stopped)["step"] == 2
     train(stopped, CONFIG, Start(resume=True))
     assert_same_state(stopped, unbroken)
