@@ -110,7 +110,9 @@ def measure(
             report(f"{name} {step.name}")
     if all(row.get("abs_rel") is None for row in rows):
         notes = "; ".join(sorted({str(row["note"]) for row in rows}))
-        raise UserError(f"nothing was measured ({notes})", series.name, "use other weights")
+        raise UserError(
+            f"nothing was measured ({notes})", series.name, "mend that, or use other weights"
+        )
     return Measured(rows, {_shown(name): record for name, record in records.items()})
 
 
@@ -131,7 +133,7 @@ def _row(
         network.check_asked(config, measurement.capture, view_sets)
         scores = evaluate_network(network, measurement.capture, view_sets, config, scoring)
     except UserError as error:
-        return head | {"note": f"{error.what}, {error.where}"}
+        return head | {"note": str(error)}
     return head | _figures(scores) | (_cost(predictor) if series.name == "architecture" else {})
 
 

@@ -41,7 +41,7 @@ from deltas_nets.captures.readers.colmap_folder import PLACES
 from deltas_nets.captures.readers.refused import refusal
 from deltas_nets.errors import UserError
 
-__all__ = ["READERS", "Reader", "ReaderOfPoses", "open_capture"]
+__all__ = ["READERS", "Reader", "ReaderOfPoses", "looks_like_capture", "open_capture"]
 
 
 class Reader(Protocol):
@@ -103,6 +103,11 @@ _LAYOUTS = (
     "a capture is a COLMAP model, a transforms.json, a frames.json, ScanNet's export or one of "
     f"{len(READERS) - 4} other formats, each with its images: see docs/captures.md"
 )
+
+
+def looks_like_capture(path: Path) -> bool:
+    """Whether a reader would read it; it may be broken, as `open_capture` explains."""
+    return any(reader.recognises(path) for reader in READERS)
 
 
 def open_capture(path: str | Path, *, intrinsics: Intrinsics | None = None) -> Capture:

@@ -1,5 +1,6 @@
 """Small text files that people write: a few words on each line, and comments."""
 
+import codecs
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,22 @@ def in_commas(words: str) -> str:
     """
     found = re.search(r"(?:^|\s)-?\d+,\d+(?:e[+-]?\d+)?(?:\s|$)", words)
     return " (decimal commas: write 0.5, not 0,5)" if found else ""
+
+
+def decoded(data: bytes) -> str:
+    """The text of a file: UTF-8, or UTF-16 where its first bytes say so.
+
+    Spreadsheets ("Unicode text") and PowerShell (what ``>`` writes) make the latter.
+
+    Raises:
+        UnicodeDecodeError: it is neither.
+
+    Example:
+        >>> decoded("fx: 9".encode("utf-16"))
+        'fx: 9'
+    """
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig")
 
 
 def read_text(path: Path, *, name: str, remedy: str) -> str:

@@ -8,8 +8,8 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
-from deltas_nets.commands.values import at_least_one, not_negative, positive
-from deltas_nets.terminal import progress
+from deltas_nets.commands.values import at_least_one, not_empty, not_negative, positive
+from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.detectors.config import TableConfig
@@ -56,6 +56,7 @@ class Detectors(Command):
     """Show the traceback of an error."""
 
     checks: ClassVar = {
+        "detectors": not_empty,
         "sets": at_least_one,
         "num_points": at_least_one,
         "nms_radius": not_negative,
@@ -65,11 +66,12 @@ class Detectors(Command):
 
     def run(self) -> None:
         """Run the command."""
+        from deltas_nets.captures.opening import looks_like_capture
         from deltas_nets.outputs.atomic_files import check_file
 
         if self.json is not None:
             check_file(self.json)
-        if self.capture.is_file():
+        if self.capture.is_file() and not looks_like_capture(self.capture):
             self._of_pairs()
         else:
             self._of_capture()
@@ -112,6 +114,9 @@ class Detectors(Command):
         check_all(capture, view_sets)
         with progress("detectors", len(pairs)) as report:
             scores = score_capture(extractors, capture, pairs, config, report=report)
+        if not capture.metric:
+            warn("the capture states no metres: what is within 5 cm is not known")
+            scores = {name: found.without_lengths() for name, found in scores.items()}
         title = f"{self.capture}: {len(pairs)} pairs of {len(view_sets)} anchors"
         Console().print(detector_table(scores, title=title))
         if self.json is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from deltas_nets.commands.evaluate_flags import without_effect
+from deltas_nets.commands.evaluate_flags import warn_of, without_effect
 from deltas_nets.commands.flags import Flag, Prediction, usable_device
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
@@ -169,7 +169,6 @@ class Evaluate(Prediction):
         from deltas_nets.evaluate.capture import Scoring, evaluate_files, evaluate_network
         from deltas_nets.evaluate.protocols.view_protocol import SceneViews
         from deltas_nets.evaluate.scores import CaptureScores
-        from deltas_nets.outputs.summary import SUMMARY, read_summary
 
         config = self.config()
         scoring = Scoring(self.range, self.truth_size, self.consistency)
@@ -179,17 +178,16 @@ class Evaluate(Prediction):
             name: str, capture: Capture, views: SceneViews, meter: CalibrationMeter
         ) -> CaptureScores:
             sets = views.view_sets
+            folder = self.predictions
+            folder = folder / name if folder is not None and many else folder
+            warn_of(name, capture, folder)
             with progress(f"evaluate {name}" if many else "evaluate", len(sets)) as report:
                 if predictor is not None:
                     predictor.check_asked(config, capture, sets)
                     return evaluate_network(
                         predictor, capture, sets, config, scoring, meter=meter, report=report
                     )
-                assert self.predictions is not None
-                folder = self.predictions / name if many else self.predictions
-                said = (read_summary(folder / SUMMARY) or {}).get("settings", {})
-                if said.get("sensor_depth", {}).get("from") == "sensor":
-                    warn("the maps were made with the sensor depth that they are scored against")
+                assert folder is not None
                 return evaluate_files(folder, capture, sets, scoring=scoring, report=report)
 
         return score

@@ -1,6 +1,32 @@
-"""Flags of `deltas evaluate` that do nothing without another."""
+"""What `deltas evaluate` says before it scores: flags that do nothing, scores that mislead."""
 
-__all__ = ["without_effect"]
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deltas_nets.terminal import warn
+
+if TYPE_CHECKING:
+    from deltas_nets.captures.capture import Capture
+
+__all__ = ["warn_of", "without_effect"]
+
+
+def warn_of(name: str, capture: "Capture", maps: Path | None) -> None:
+    """Warn where scores of a scene are not what they look like.
+
+    Args:
+        name: of the scene.
+        capture: with the true depth.
+        maps: the folder of maps that are there already, if they are.
+    """
+    from deltas_nets.outputs.summary import SUMMARY, read_summary
+    from deltas_nets.outputs.their_capture import in_their_unit
+
+    if not (capture if maps is None else in_their_unit(capture, maps)).metric:
+        warn(f"{name}: lengths and --depth-range are in its own unit, not in metres")
+    said = {} if maps is None else (read_summary(maps / SUMMARY) or {}).get("settings", {})
+    if said.get("sensor_depth", {}).get("from") == "sensor":
+        warn("the maps were made with the sensor depth that they are scored against")
 
 
 def without_effect(

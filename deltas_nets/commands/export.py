@@ -64,8 +64,9 @@ class Export(Command):
             refinement=self.refinement,
         )
         check_file(self.out)
-        what = "the reference network is not exported"
-        remedy = "name weights of deltas train"
+        # Of ours alone: a baseline is no network, and the reference is the authors' to export.
+        what = "this is no network of deltas train, and is not exported"
+        remedy = "name deltas-small, or its weights.safetensors"
         model = load_predictor(self.weights).deltas(what, self.weights, remedy)
         # Only the name: where files are is the machine's, and private.
         record = {**weights_record(self.weights), "name": Path(self.weights).name}

@@ -8,7 +8,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, sensible, usable_device
-from deltas_nets.commands.values import at_least_one, not_negative
+from deltas_nets.commands.values import at_least_one, not_empty, not_negative
 from deltas_nets.terminal import progress
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class MeasuredSeries(Command):
     checks: ClassVar = {
         "sets": at_least_one,
         "seed": not_negative,
+        "weights": not_empty,
     }
 
     def measured(self, series: "Series", path: Path, *, kind: str, num_views: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
-__all__ = ["at_least_one", "check_values", "not_negative", "positive", "read_shard"]
+__all__ = ["at_least_one", "check_values", "not_empty", "not_negative", "positive", "read_shard"]
 
 LEAST_SIDE = 32  # px
 
@@ -31,6 +31,7 @@ def check_values(command: Command) -> None:
         check = command.checks.get(field.name) or CHECKS.get(field.name)
         if value is not None and check is not None:
             check(value, f"--{field.name.replace('_', '-')}")
+    _check_out(command)
     # Of several scenes it lies in each, and is looked for once these are known.
     sets, capture = getattr(command, "view_sets", None), getattr(command, "capture", None)
     if sets is not None and capture is not None:
@@ -41,6 +42,16 @@ def check_values(command: Command) -> None:
         if completes:
             remedy = "use 2 or more, or add --sensor-depth, which is completed then"
         raise UserError("one view alone has no depth", "--views 1", remedy)
+
+
+def _check_out(command: Command) -> None:
+    """Refuse to write among the files of a capture, where results would be read as its images."""
+    out, capture = getattr(command, "out", None), getattr(command, "capture", None)
+    if isinstance(out, Path) and isinstance(capture, Path):
+        folder = capture if capture.is_dir() else capture.parent
+        if out.is_dir() and out.resolve() == folder.resolve():
+            what = "the output folder is the capture itself"
+            raise UserError(what, out, "name another folder with --out")
 
 
 def _range(value: tuple[float, float], flag: str) -> None:
@@ -75,6 +86,16 @@ def at_least_one(value: int, flag: str) -> None:
     """
     if value < 1:
         raise UserError("too few", f"{flag} {value}", "use 1 or more")
+
+
+def not_empty(value: tuple[object, ...], flag: str) -> None:
+    """A list of what is to be measured.
+
+    Raises:
+        UserError: there is nothing in it.
+    """
+    if not value:
+        raise UserError("nothing is named", flag, "name one or more, or leave it out")
 
 
 def not_negative(value: float, flag: str) -> None:

@@ -97,13 +97,22 @@ def _unknown(match: re.Match[str], commands: Mapping[str, type[Command]]) -> str
         known = f"did you mean {near[0]}?" if near else f"there are {', '.join(commands)}"
         return f"no command {first}: {known}"
     what = f"no option {first}" if first.startswith("-") else f"{first} is one word too many"
-    meant = _meant(first, match.string.partition("Perhaps you meant: ")[2])
+    suggested = match.string.partition("Perhaps you meant: ")[2]
+    others = [command for name, command in _suggested(suggested) if name == first]
+    if others:
+        return f"{what} here: deltas {others[0]} has it"
+    meant = _meant(first, suggested)
     return what + (f": did you mean {meant}?" if meant else "")
+
+
+def _suggested(words: str) -> list[tuple[str, str]]:
+    """The options that tyro suggests, and their commands."""
+    return re.findall(r"(--[\w.-]+) (?:(?! --help).)*? in deltas (\w+) --help", words)
 
 
 def _meant(option: str, suggested: str) -> str | None:
     """Of the options that tyro suggests, of several commands, the nearest of the first one."""
-    known = re.findall(r"(--[\w.-]+) (?:(?! --help).)*? in deltas (\w+) --help", suggested)
+    known = _suggested(suggested)
     names = [name for name, command in known if command == known[0][1]]
     return next(iter([*get_close_matches(option, names, n=1), *names]), None)
 

@@ -158,6 +158,7 @@ def _evaluate(
     scores: dict[str, MapScores | None] = {}
     failed: dict[str, UserError] = {}
     own, seen = CalibrationMeter(), SeenMaps()
+    measured: list[float] = []
     for views in view_sets:
         try:
             check_frames(capture, [views], with_depth=True)
@@ -167,6 +168,8 @@ def _evaluate(
             failed[views.anchor] = error
             report(views.anchor)
             continue
+        known = truth.own[truth.own > 0]
+        measured += [float(known.min()), float(known.max())] if known.size else []
         scores[views.anchor] = _score(found, truth, scoring, own)
         if scoring.consistency:
             seen.add(frame, found.depth, truth.at_image)
@@ -174,8 +177,7 @@ def _evaluate(
     if failed and not scores:
         raise next(iter(failed.values()))
     if all(score is None for score in scores.values()):
-        what, remedy = "no anchor has true depth in range", "name a capture with sensor depth"
-        raise UserError(what, capture.path, remedy)
+        raise _none_in_range(capture, scoring.depth_range, measured)
     if meter is not None:
         meter.take(own)
     return mean_scores(
@@ -184,6 +186,20 @@ def _evaluate(
         failed={id: str(error) for id, error in failed.items()},
         consistency=seen.result() if scoring.consistency else None,
     )
+
+
+def _none_in_range(
+    capture: Capture, depth_range: tuple[float, float], measured: Sequence[float]
+) -> UserError:
+    """What to say where nothing could be scored: nothing is measured, or in another range."""
+    if not measured:
+        what = "no anchor has true depth in range"
+        return UserError(what, capture.path, "name a capture with sensor depth")
+    near, far = depth_range
+    found = f"{min(measured):.3g} to {max(measured):.3g}"
+    what = f"all true depth ({found}) is outside {near:g} to {far:g}"
+    unit = "in metres" if capture.metric else "in the capture's own unit"
+    return UserError(what, capture.path, f"give --depth-range NEAR FAR {unit}")
 
 
 def _score(

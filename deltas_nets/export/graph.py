@@ -44,6 +44,8 @@ class ExportConfig:
             raise ValueError(f"there must be 2 views or more, got {self.num_views}")
         if self.num_points < 8:
             raise ValueError(f"there must be 8 points or more, got {self.num_points}")
+        if self.num_points > self.image_size[0] * self.image_size[1]:
+            raise ValueError(f"there are fewer pixels than points, got {self.num_points} points")
         if min(self.image_size) < 32:
             raise ValueError(f"images must be 32 x 32 pixels or more, got {self.image_size}")
         if self.refinement < 1:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,7 +66,8 @@ def fit(
     Raises:
         UserError: a file to start from is missing or does not fit, there is nothing to train on,
             or training diverged; in all processes.
-        KeyboardInterrupt: Ctrl-C or SIGTERM, after the step was finished and saved.
+        KeyboardInterrupt: Ctrl-C or SIGTERM, after the step was finished and saved. A validation
+            is left undone, and made up for by the run that goes on.
     """
     fabric = launch_fabric(config)
     tell = report if fabric.is_global_zero else _silently
@@ -92,7 +94,20 @@ def fit(
         remove_half_written(folder)
     save()  # before the first step, so that a run can always be resumed
     failures = 0
-    with StopRequest() as request, _log(fabric, folder, config, step, report) as log:
+    log_of_run = _log(fabric, folder, config, step, report)
+    with StopRequest(tells=fabric.is_global_zero) as request, log_of_run as log:
+
+        def validate_at(step: int) -> None:
+            if step == 0 or (step % validate_every and step != last) or log.validated(step):
+                return
+            save()  # a validation takes minutes: who stops or kills it meanwhile loses no step
+            # Of several processes the others would wait for the first one.
+            alone = request.obeyed_at_once() if fabric.world_size == 1 else nullcontext()
+            with alone:
+                metrics = metrics_of(state.average.model, held_out)
+            log.validation(step, metrics)
+
+        validate_at(step)  # where a run that was stopped left it undone
         for rooms in loader:
             began = time.perf_counter()
             rate = set_learning_rate(state.optimizer, step, config)
@@ -110,16 +125,12 @@ def fit(
                 what = f"training diverged: no usable gradient in the {PATIENCE} steps up to {step}"
                 raise UserError(what, folder, "lower --learning-rate")
             stopped = result.stop and step < last
-            if stopped:
-                save()  # whoever stops a run may not wait for its validation
-            if (step % validate_every == 0 or step == last) and fabric.is_global_zero:
-                log.validation(step, metrics_of(state.average.model, held_out))
-            # After the validation: a run whose last checkpoint is written lacks nothing.
-            if step % checkpoint_every == 0 or step == last:
+            if stopped or step % checkpoint_every == 0 or step == last:
                 save()
-            if stopped:
+            if stopped:  # whoever stops a run does not wait for its validation
                 fabric.barrier()  # torchrun ends the others when one is gone
                 raise KeyboardInterrupt
+            validate_at(step)
     fabric.barrier()
     return folder / WEIGHTS
 

@@ -37,6 +37,10 @@ class RunLog:
     def validation(self, step: int, metrics: Mapping[str, float]) -> None:
         """Metrics after a step."""
 
+    def validated(self, step: int) -> bool:
+        """Whether it has those of a step, or wants none."""
+        return True
+
 
 class FolderLog(RunLog):
     """Writes log.jsonl and, where the package tensorboard is installed, its event files.
@@ -54,6 +58,7 @@ class FolderLog(RunLog):
         file = folder / LOG
         drop_later_entries(file, step)
         self.report = report
+        self._validated = _validated_steps(file)
         self._held_out = "rooms" if config.data.scannet.validation is None else "scenes"
         self._file = file.open("a", encoding="utf-8")
         self._curves = _curves(folder / CURVES, step)
@@ -94,9 +99,14 @@ class FolderLog(RunLog):
 
     def validation(self, step: int, metrics: Mapping[str, float]) -> None:
         """A line, a point on every curve, and a message."""
+        self._validated.add(step)
         self._write({"step": step, "validation": metrics})
         self._draw("validation", metrics, step)
         self.report(f"step {step}: held-out {self._held_out} {_in_words(metrics)}")
+
+    def validated(self, step: int) -> bool:
+        """Whether there is such a line."""
+        return step in self._validated
 
     def _write(self, entry: Mapping[str, object]) -> None:
         print(json.dumps(plain(entry)), file=self._file, flush=True)
@@ -106,6 +116,14 @@ class FolderLog(RunLog):
             for name, value in values.items():
                 self._curves.add_scalar(f"{group}/{name}", value, step)
             self._curves.flush()
+
+
+def _validated_steps(file: Path) -> set[int]:
+    """Of a log without broken lines."""
+    if not file.exists():
+        return set()
+    entries = (json.loads(line) for line in file.read_text(encoding="utf-8").splitlines())
+    return {entry["step"] for entry in entries if "validation" in entry}
 
 
 def drop_later_entries(file: Path, step: int) -> None:

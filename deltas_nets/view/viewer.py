@@ -2,6 +2,7 @@
 
 import io
 import math
+import socket
 from contextlib import redirect_stdout
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,7 @@ from deltas_nets.page.scene import (
 if TYPE_CHECKING:
     from viser import ViserServer
 
-__all__ = ["check_extra", "open_viewer"]
+__all__ = ["check_address", "check_extra", "open_viewer"]
 
 MOST_POINTS, MOST_FACES = 400_000, 400_000
 MOST_IMAGES, IMAGE_LONGEST = 200, 160
@@ -48,6 +49,24 @@ def check_extra() -> None:
     if find_spec("viser") is None:
         remedy = 'pip install "deltas-depth[view]"'
         raise UserError("the viewer needs the package viser", "deltas view", remedy)
+
+
+def check_address(host: str) -> None:
+    """Can this machine serve there? viser tries one port after another for ever where it cannot.
+
+    Raises:
+        UserError: it has no such address.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind, protocol) as attempt:
+            attempt.bind(address)
+    except (OSError, UnicodeError) as error:
+        what = "this machine has no such address"
+        remedy = "give 127.0.0.1 for this machine alone, or 0.0.0.0 for all that reach it"
+        raise UserError(what, f"--host {host}", remedy) from error
 
 
 def open_viewer(

@@ -93,7 +93,14 @@ def launch(
     )
 
 
-def train(folder: Path, config: TrainConfig, start: Start, *, stop: int | None = None) -> None:
+def train(
+    folder: Path,
+    config: TrainConfig,
+    start: Start,
+    *,
+    stop: int | None = None,
+    validate_every: int = 500,
+) -> None:
     """Train in this process; validation looks at one small room."""
     rooms, threads = fit_module.validation_rooms, torch.get_num_threads()
     kept = Path(config.data.cache) if config.data.cache else None
@@ -105,6 +112,7 @@ def train(folder: Path, config: TrainConfig, start: Start, *, stop: int | None =
             folder,
             start,
             checkpoint_every=3,
+            validate_every=validate_every,
             log_every=1,
             stop=stop,
             report=lambda message: None,

@@ -240,6 +240,11 @@ def test_folders_of_captures_with_dots_in_their_names_do_not_collide(tmp_path: P
     assert Depth(capture=tmp_path / "frames.json").folder == Path("frames-depth")
 
 
+def test_an_option_of_another_command_is_told_whose_it_is(run: Run, tmp_path: Path) -> None:
+    said = run("depth", tmp_path, "--glb")
+    assert_one_line(said, "no option --glb here: deltas fuse has it", "deltas depth --help")
+
+
 def test_debug_shows_the_traceback(run: Run, tmp_path: Path) -> None:
     with pytest.raises(Exception, match="does not exist"):
         run("depth", tmp_path / "none", "--out", tmp_path / "out", "--debug")

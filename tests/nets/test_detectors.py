@@ -1,6 +1,7 @@
 """Detectors beside each other: what counts as a point, a match, a right pose; table and record."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
 from deltas_nets.config import DetectorConfig, NetworkConfig
 from deltas_nets.distill.superpoint import SuperPoint
 from deltas_nets.errors import UserError
@@ -291,6 +294,27 @@ def test_the_command_reads_pairs_without_depth(run: Run, tmp_path: Path) -> None
         file.write_text(wrong)
         with pytest.raises(UserError, match=what):
             read_pairs(file)
+
+
+def test_the_file_of_a_capture_is_no_list_of_pairs(run: Run, tmp_path: Path) -> None:
+    capture = open_capture(write_capture(tmp_path / "capture", 3, image_size=SIZE))
+    save_capture(capture, tmp_path / "own", "own")
+    result = run("detectors", tmp_path / "own" / "frames.json", "--detectors", "orb")
+    assert result.code == 0 and "trans@5cm" in result.out, result.err
+    image = next((tmp_path / "own" / "images").iterdir())
+    assert_one_line(run("detectors", image, "--detectors", "orb"), "is not text", "38 words")
+    assert_one_line(run("detectors", tmp_path / "own", "--detectors"), "nothing is named")
+
+
+def test_without_metres_no_length_is_scored(run: Run, tmp_path: Path) -> None:
+    capture = open_capture(write_capture(tmp_path / "capture", 3, image_size=SIZE))
+    save_capture(replace(capture, metric=False), tmp_path / "own", "own")
+    file = tmp_path / "t.json"
+    result = run("detectors", tmp_path / "own", "--detectors", "orb", "--json", file)
+    assert result.code == 0 and "states no metres" in result.err
+    (row,) = read_record(file).rows
+    assert row["translation"] is None and row["translation_median"] is None
+    assert row["rotation"] is not None
 
 
 def test_a_capture_without_depth_is_refused_before_anything_is_written(

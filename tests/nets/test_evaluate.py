@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ from PIL import Image
 from run_command import Result, Run, assert_one_line
 from small_capture import write_capture
 
+from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
+from deltas_nets.captures.scaled import in_metres
 from deltas_nets.commands.evaluate import Evaluate
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.record import read_record
@@ -331,3 +335,15 @@ def test_contradictions_are_refused_in_one_line(two_scenes: Path, run: Run, tmp_
         (("--rooms", 1, "--consistency"), "--rooms"),
     ):
         assert_one_line(run("evaluate", *arguments), said)
+
+
+def test_depth_in_another_unit_is_told_from_none(run: Run, tmp_path: Path) -> None:
+    metres = open_capture(write_capture(tmp_path / "walk", 3))
+    own = replace(in_metres(replace(metres, metric=False), 1000.0), metric=False)
+    save_capture(own, tmp_path / "millimetres", "own")
+    command = ["evaluate", tmp_path / "millimetres", "--weights", "plane-sweep", "--sets", 1]
+    result = run(*command)
+    assert result.code == 2 and "is outside 0.5 to 10" in result.err
+    assert "--depth-range NEAR FAR in the capture's own unit" in result.err
+    result = run(*command, "--depth-range", 500, 10000)
+    assert result.code == 0 and "in its own unit, not in metres" in result.err

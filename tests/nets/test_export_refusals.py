@@ -146,6 +146,11 @@ def test_the_command_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("export", "--out", out, "--size", 8, 8), "--size 8 8", "32 or more")
     assert_one_line(run("export", "--out", out, "--depth-range", 3, 1), "NEAR < FAR")
     assert_one_line(run("export", "--out", out, "--weights", "nothing"), "no such weights")
+    assert_one_line(
+        run("export", "--out", out, "--weights", "plane-sweep"), "plane-sweep: name del"
+    )
+    small = ["export", "--out", out, "--size", 32, 32]
+    assert_one_line(run(*small, "--points", 10**6), "fewer pixels than points")
     assert_one_line(run("export"), "--out", "see deltas export --help")
     assert not out.exists()
 

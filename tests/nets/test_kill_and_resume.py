@@ -1,16 +1,20 @@
 """SIGKILL in the middle of a checkpoint costs the steps since the last one, and nothing else."""
 
+import json
 import os
 import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from run_fit import CONFIG as CONFIG_OF_FOUR
 from run_fit import assert_same_state, finish, launch, logged, read_checkpoint, train
 
+from deltas_nets.train import fit as fit_module
 from deltas_nets.train.fit import Start
+from deltas_nets.train.log import LOG
 
 HALF_WRITTEN = ".checkpoint.pt.*.deltas-tmp"
 CONFIG = replace(CONFIG_OF_FOUR, batch_size=2, steps=7)
@@ -19,7 +23,7 @@ CONFIG = replace(CONFIG_OF_FOUR, batch_size=2, steps=7)
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unbroken")
-    train(folder, CONFIG, Start())
+    train(folder, CONFIG, Start(), validate_every=3)
     return folder
 
 
@@ -56,6 +60,39 @@ def test_a_signal_to_the_whole_group_ends_it_between_two_steps(
     said = finish(launch(stopped, ahead, "stop-all"), code=-signal.SIGINT)
     assert "KeyboardInterrupt" in said
     assert "exited unexpectedly" not in said
+    assert said.count("stopping after this step") == 1
     assert read_checkpoint(stopped)["step"] == 2
     train(stopped, CONFIG, Start(resume=True))
     assert_same_state(stopped, unbroken)
+
+
+@pytest.mark.parametrize("step", [3, 7], ids=["on the way", "at the end"])
+def test_a_stop_does_not_wait_for_a_validation_which_is_made_up_for(
+    tmp_path: Path, unbroken: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """It takes minutes; what was trained by then is kept."""
+    stopped, validate = tmp_path / "stopped", fit_module.metrics_of
+    calls: list[int] = []
+
+    def interrupted(*arguments: Any) -> dict[str, float]:
+        calls.append(3 * len(calls) + 3)
+        if min(calls[-1], CONFIG.steps) == step:
+            signal.raise_signal(signal.SIGTERM)
+            pytest.fail("it went on")
+        return validate(*arguments)
+
+    monkeypatch.setattr(fit_module, "metrics_of", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(stopped, CONFIG, Start(), validate_every=3)
+    assert read_checkpoint(stopped)["step"] == step
+    monkeypatch.undo()
+    train(stopped, CONFIG, Start(resume=True), validate_every=3)
+    assert_same_state(stopped, unbroken)
+    assert logged(stopped) == logged(unbroken)
+    assert validations(stopped) == validations(unbroken) != []
+
+
+def validations(folder: Path) -> list[tuple[int, dict[str, float]]]:
+    lines = (folder / LOG).read_text().splitlines()
+    entries = [json.loads(line) for line in lines]
+    return [(entry["step"], entry["validation"]) for entry in entries if "validation" in entry]

@@ -89,10 +89,28 @@ def test_focal_lengths_and_angles_of_root_and_frame(
         ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, Lens("OPENCV_FISHEYE", (0, 0, 0, 0.1))),
         ({"is_fisheye": True, "k1": 0.1}, Lens("OPENCV_FISHEYE", (0.1, 0, 0, 0))),
         ({"camera_model": "EQUIRECTANGULAR"}, Lens("EQUIRECTANGULAR", ())),
+        ({"camera_model": "opencv_fisheye"}, Lens("OPENCV_FISHEYE", (0, 0, 0, 0))),
+        ({"camera_model": "OpenCV Fisheye"}, Lens("OPENCV_FISHEYE", (0, 0, 0, 0))),
+        ({"camera_model": "fisheye", "k1": 0.1}, Lens("OPENCV_FISHEYE", (0.1, 0, 0, 0))),
+        ({"camera_model": "perspective"}, None),
+        ({"camera_model": "Pinhole"}, None),
+        ({"camera_model": "", "k1": 0.1}, Lens("OPENCV", (0.1, 0, 0, 0))),
+        ({"camera_model": "", "is_fisheye": True}, Lens("OPENCV_FISHEYE", (0, 0, 0, 0))),
+        (
+            {"distortion_params": [0.1, 0.2, 0, 0, 0.3, 0.4], "k1": 9.0},
+            Lens("OPENCV", (0.1, 0.2, 0.3, 0.4)),
+        ),
     ],
 )
 def test_lenses(tmp_path: Path, said: dict[str, Any], lens: Lens | None) -> None:
     assert the_frame(open_capture(write(tmp_path, **said))).lens == lens
+
+
+def test_distortion_of_a_frame_goes_before_that_of_the_root(tmp_path: Path) -> None:
+    listed = {"distortion_params": [0.1, 0, 0, 0, 0, 0]}
+    assert the_frame(open_capture(write(tmp_path, listed, k1=0.2))).lens.coefficients[0] == 0.1
+    with pytest.raises(UserError, match="distortion_params of 4 numbers"):
+        open_capture(write(tmp_path, distortion_params=[0.1, 0, 0, 0]))
 
 
 @pytest.mark.parametrize(

@@ -229,10 +229,19 @@ def test_a_table_that_was_stopped_goes_on_and_measures_nothing_twice(
     assert (tmp_path / "out" / "ratio.png").stat().st_size > 5000
 
 
+def test_nothing_is_written_among_the_files_of_a_capture(run: Run, tmp_path: Path) -> None:
+    where = write_capture(tmp_path / "walk", 3)
+    before = sorted(where.rglob("*"))
+    for command in (["ablate", "nms"], ["robustness", "order"]):
+        assert_one_line(run(*command, where, "--out", where), "is the capture itself", "--out")
+        assert_one_line(run(*command, where, "--out", "o", "--weights"), "nothing is named")
+    assert sorted(where.rglob("*")) == before
+
+
 def test_what_a_network_lacks_is_said_by_name(run: Run, tmp_path: Path, weights: Path) -> None:
     where = write_capture(tmp_path / "walk", 3)
     common = [where, "--out", tmp_path / "out", "--weights", weights]
-    assert_one_line(run("ablate", "offsets", *common), "nothing was measured", "--offset")
+    assert_one_line(run("ablate", "offsets", *common), "nothing was measured", "leave it out")
     result = run("robustness", "views", *common, "--sets", 1)
     assert result.code == 0 and "no view set has 8 views" in result.out
     rows = read_record(tmp_path / "out" / "views.json").rows

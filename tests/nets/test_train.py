@@ -138,7 +138,7 @@ def test_a_run_told_to_stop_finishes_its_step_and_goes_on_later(
     assert_same_state(tmp_path, unbroken)
 
 
-def test_a_run_told_to_stop_where_it_validates_is_saved_and_does_so(
+def test_a_run_told_to_stop_where_it_validates_leaves_that_to_the_one_that_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     take, saved = Stepper.__call__, []
@@ -150,12 +150,15 @@ def test_a_run_told_to_stop_where_it_validates_is_saved_and_does_so(
         saved.append(read_checkpoint(tmp_path)["step"])
         return {}
 
-    monkeypatch.setattr(Stepper, "__call__", told)
     monkeypatch.setattr(fit_module, "validate", validate)
-    with pytest.raises(KeyboardInterrupt):
-        fit(CONFIG, tmp_path, Start(), validate_every=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(Stepper, "__call__", told)
+        with pytest.raises(KeyboardInterrupt):
+            fit(CONFIG, tmp_path, Start(), validate_every=1)
+    assert read_checkpoint(tmp_path)["step"] == 1 and not saved
+    fit(CONFIG, tmp_path, Start(resume=True), validate_every=1, stop=2)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines if "validation" in line] == saved == [1]
+    assert [line["step"] for line in lines if "validation" in line] == saved == [1, 2]
 
 
 def test_a_finished_run_has_nothing_left_to_do(copy: Path) -> None:

@@ -49,6 +49,9 @@ def test_the_command_serves_until_it_is_stopped(
     assert result.code == 0 and not result.err
     assert result.out == f"look at http://127.0.0.1:{asked[0]}; Ctrl-C ends it\n"
     assert_one_line(run("view", capture, "--port", 0), "--port 0")
+    # An address that is kept for examples (RFC 5737), and a name of none.
+    for host in ("192.0.2.1", "nowhere.invalid"):
+        assert_one_line(run("view", capture, "--host", host), "no such address", host)
     assert_one_line(run("view", capture, tmp_path / "nowhere"), "run it first")
 
 

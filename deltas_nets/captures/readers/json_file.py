@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.text_lines import decoded
 from deltas_nets.errors import UserError
 
 __all__ = ["Fields", "read_json"]
@@ -36,7 +37,7 @@ def read_json(path: Path, *, name: str, remedy: str, limit: int = JSON_LIMIT) ->
         if size > limit:
             what = f"the {name} file has {size / 2**20:.0f} MiB, more than {limit / 2**20:g}"
             raise UserError(what, path, remedy)
-        text = path.read_bytes().decode("utf-8-sig")
+        text = decoded(path.read_bytes())
         if not text.strip():
             raise UserError(f"the {name} file is empty", path, remedy)
         return json.loads(text, object_pairs_hook=_once)

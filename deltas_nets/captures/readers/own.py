@@ -30,6 +30,7 @@ from deltas_nets.captures.readers.own_cameras import (
     sized,
     stated_camera,
 )
+from deltas_nets.captures.readers.own_csv import read_csv
 from deltas_nets.captures.readers.own_points import read_points
 from deltas_nets.captures.readers.own_poses import pose_of
 from deltas_nets.captures.readers.own_table import (
@@ -38,7 +39,6 @@ from deltas_nets.captures.readers.own_table import (
     ROOT,
     VERSION,
     check_keys,
-    read_csv,
 )
 from deltas_nets.captures.readers.units import is_metric
 from deltas_nets.errors import UserError
@@ -83,6 +83,11 @@ def read(path: Path) -> Capture:
         else:
             frames.append(frame)
     packed = Frames.of(frames, file.parent)
+    ignored = [
+        f"{other.name} is not read, as {file.name} is there"
+        for other in files[1:]
+        if other.is_file() and other != file
+    ]
     ids = [entry.id for entry in entries]
     fields = dict(zip(ids, (entry.fields for entry in entries), strict=True))
     used = [fields[id] for id in packed]
@@ -92,6 +97,7 @@ def read(path: Path) -> Capture:
         frames=packed,
         lost=lost,
         doubts=(
+            *ignored,
             *finder.doubts(),
             *doubts_of_sizes(cameras.values()),
             *depths.doubts_of_missing("depth"),

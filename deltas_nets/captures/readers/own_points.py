@@ -12,6 +12,7 @@ from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.json_file import Fields
 from deltas_nets.captures.readers.own_table import REMEDY
+from deltas_nets.captures.text_lines import decoded
 from deltas_nets.errors import UserError
 
 __all__ = ["read_points"]
@@ -86,22 +87,28 @@ def _file(root: Fields, key: str, folder: Path) -> Path:
 
 
 def _table(file: Path, columns: Sequence[str], *, least: int) -> FloatArray:
-    """Numbers in the order of the columns; the first line may name them."""
+    """Numbers in the order of the columns; the first line may name them.
+
+    As in frames.csv, decimal commas may be where semicolons or tabs stand between numbers.
+    """
     names = ",".join(columns)
     try:
-        with file.open(encoding="utf-8-sig") as lines:
-            first = lines.readline(1000).strip().replace(" ", "")
-        given = first.split(",")
+        lines = decoded(file.read_bytes()).splitlines()
+        first = lines[0] if lines else ""
+        mark = next((mark for mark in ";\t" if mark in first), ",")
+        given = first.replace(" ", "").lower().split(mark)
         if not (least <= len(given) <= len(columns)):
-            raise UserError(f"the first line is not {names}", file, REMEDY)
+            remedy = f"begin with a line {','.join(columns[:least])}, or {names}"
+            raise UserError(f"the first line is {first[:40]!r}, not {names}", file, remedy)
         header = given == list(columns[: len(given)])
+        if mark != ",":
+            lines = [line.replace(",", ".") for line in lines]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that there is no line
-            table = np.loadtxt(
-                file, delimiter=",", skiprows=int(header), ndmin=2, encoding="utf-8-sig"
-            )
+            table = np.loadtxt(lines, delimiter=mark, skiprows=int(header), ndmin=2)
     except UnicodeDecodeError as error:
-        raise UserError("the file is not text in UTF-8", file, REMEDY) from error
+        remedy = "save it as UTF-8 (spreadsheets: CSV UTF-8)"
+        raise UserError("the file is not text in UTF-8", file, remedy) from error
     except ValueError as error:
         detail = " ".join(str(error).split())[:120]
         what = f"not every line is of the numbers {names} ({detail})"

@@ -46,6 +46,8 @@ def matrix_of(frame: Fields, key: str) -> FloatArray:
     rows = frame.values[key]
     if isinstance(rows, list) and len(rows) in (12, 16):
         flat = frame.numbers(key, (len(rows),), finite=False).reshape(-1, 4)
+    elif isinstance(rows, list) and not any(isinstance(row, list) for row in rows):
+        raise frame.error(f"has a {key} of {len(rows)} numbers, not 12 or 16")
     else:
         count = 3 if isinstance(rows, list) and len(rows) == 3 else 4
         flat = frame.numbers(key, (count, 4), finite=False)

@@ -12,6 +12,9 @@ TOLERANCE = 2e-3
 """Largest entry of R^T R - I. Six digits after the point give 1e-5, 7-Scenes as published
 1.5e-4; a scale of 0.1 %, the least that would matter to metric depth, gives 2e-3."""
 
+ROUNDED = 2e-2
+"""What two digits after the point give, at most: sqrt(3) / 100. Who prints so means a rotation."""
+
 
 class NotRigid(NamedTuple):
     """Why a matrix is no pose.
@@ -56,6 +59,8 @@ def why_not_rigid(matrix: FloatArray) -> NotRigid | None:
             remedy = "divide the rotation by it, and a world-to-camera translation, too"
             return NotRigid(what, remedy)
         what = f"is not rigid: its rotation is off orthogonal by {error:.2g}"
+        if error <= ROUNDED:
+            return NotRigid(what, "write its numbers with six digits after the point, or more")
         return NotRigid(what, "write a rotation and a translation, without scale or shear")
     if np.linalg.det(rotation) < 0:
         what = "mirrors: its rotation has determinant -1"

@@ -13,9 +13,13 @@ __all__ = ["INTRINSICS", "StatedCamera", "stated_camera"]
 STRAIGHT = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PANORAMA = "EQUIRECTANGULAR"
+BY_OTHER_NAMES = {"PERSPECTIVE": "OPENCV", "FISHEYE": "OPENCV_FISHEYE", "SPHERICAL": PANORAMA}
+"""What programs besides nerfstudio call them; none is a model of another kind in COLMAP."""
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""In the order of nerfstudio's distortion_params."""
 INTRINSICS = (
     "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model",
-    "camera_angle_x", "camera_angle_y", "is_fisheye",
+    "camera_angle_x", "camera_angle_y", "is_fisheye", "distortion_params",
 )  # fmt: skip
 """What may be at the root or in a frame."""
 
@@ -85,24 +89,37 @@ def _focal(frame: Fields, both: Fields, lens: Lens | None) -> tuple[tuple[float,
 
 
 def _lens(both: Fields) -> Lens | None:
-    k1, k2, k3, k4, p1, p2 = (
-        both.number(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")
-    )
-    model = both.text("camera_model", "OPENCV_FISHEYE" if both.truth("is_fisheye") else "OPENCV")
+    k1, k2, k3, k4, p1, p2 = _coefficients(both)
+    stated = both.text("camera_model", "").strip()
+    plain = stated.upper().replace("-", "_").replace(" ", "_")
+    model = BY_OTHER_NAMES.get(plain, plain)
+    if not model:
+        model = "OPENCV_FISHEYE" if both.truth("is_fisheye") else "OPENCV"
     if model in FISHEYE:
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
     if model == PANORAMA:
         return Lens(PANORAMA, ())
     if model not in STRAIGHT:
-        known = ", ".join(("OPENCV", "OPENCV_FISHEYE", "PINHOLE", PANORAMA))
+        known = ", ".join((*STRAIGHT, *FISHEYE, PANORAMA))
         raise both.error(
-            f"has a camera_model that is not read, {model[:40]} (read are {known})", "camera_model"
+            f"has a camera_model that is not read, {stated[:40]} (read are {known})", "camera_model"
         )
     if k4:
         raise both.error(f"has a k4 of {k4:g}, which only fisheye lenses have", "k4")
     if k3:
         return Lens("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     return Lens("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else None
+
+
+def _coefficients(both: Fields) -> list[float]:
+    """k1, k2, k3, k4, p1, p2; a list of them goes before single ones, as in nerfstudio."""
+    if "distortion_params" not in both:
+        return [both.number(name, 0.0) for name in COEFFICIENTS]
+    listed = both.numbers("distortion_params", (-1,)).tolist()
+    if len(listed) != len(COEFFICIENTS):
+        what = f"has distortion_params of {len(listed)} numbers, not {' '.join(COEFFICIENTS)}"
+        raise both.error(what, "distortion_params")
+    return list(listed)
 
 
 def _size(both: Fields) -> tuple[int, int] | None:

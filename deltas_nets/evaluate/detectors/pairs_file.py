@@ -17,6 +17,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.captures.images import decode, resize_image
+from deltas_nets.captures.text_lines import read_text
 from deltas_nets.captures.work_size import fit_work_size
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.detectors.config import WORK_PIXELS, TableConfig
@@ -79,12 +80,13 @@ def read_pairs(file: Path) -> list[ImagePair]:
         UserError: a line is not of the form above, or an image is not there.
     """
     pairs = []
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
+    remedy = "write NAME NAME ROTATED ROTATED, K of both and second_from_first: 38 words"
+    text = read_text(file, name="list of pairs", remedy=remedy)
+    for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
             continue
         where = f"{file}, line {number}"
-        remedy = "write NAME NAME ROTATED ROTATED, K of both and second_from_first: 38 words"
         if len(words) != NUMBERS:
             raise UserError(f"{len(words)} words", where, remedy)
         try:

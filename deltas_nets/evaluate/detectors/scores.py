@@ -108,6 +108,10 @@ class DetectorScores(NamedTuple):
     translation_median: float
     pairs: int
 
+    def without_lengths(self) -> "DetectorScores":
+        """What stays of them where nobody knows how long the unit of the world is."""
+        return self._replace(translation=math.nan, translation_median=math.nan)
+
 
 def score_pair(
     views: PosedViews,
