@@ -22,6 +22,8 @@ INTRINSICS = (
     "camera_angle_x", "camera_angle_y", "is_fisheye", "distortion_params",
 )  # fmt: skip
 """What may be at the root or in a frame."""
+OTHER_WORDS = ("K", "intrinsics", "intrinsic_matrix", "camera_matrix", "fx", "focal_length")
+"""Of other formats, whose pixels may be counted from elsewhere."""
 
 
 class StatedCamera(NamedTuple):
@@ -60,7 +62,7 @@ def stated_camera(root: Fields, frame: Fields) -> StatedCamera:
     Raises:
         UserError: there is no focal length, a number is none, or the lens is not known.
     """
-    both = Fields.merged((root, frame), INTRINSICS)
+    both = Fields.merged((root, frame), (*INTRINSICS, *OTHER_WORDS))
     lens = _lens(both)
     focal, of_angles = _focal(frame, both, lens)
     centre = (both.number("cx"), both.number("cy")) if "cx" in both and "cy" in both else None
@@ -78,7 +80,9 @@ def _focal(frame: Fields, both: Fields, lens: Lens | None) -> tuple[tuple[float,
             raise both.error(f"has focal lengths that are not positive ({focal:g})", "fl_x")
         return both_focal, False
     if "camera_angle_x" not in both:
-        raise both.error("has no focal length (fl_x or camera_angle_x)")
+        other = next((f" but {word}" for word in OTHER_WORDS if word in both), "")
+        written = "; write fl_x, fl_y, cx, cy" if other else ""
+        raise both.error(f"has no focal length (fl_x or camera_angle_x){other}{written}")
     angles = both.number("camera_angle_x"), both.number("camera_angle_y", 0.0)
     if not (0 < angles[0] < math.pi and 0 <= angles[1] < math.pi):
         key = "camera_angle_x" if not 0 < angles[0] < math.pi else "camera_angle_y"
