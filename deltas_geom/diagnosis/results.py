@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from deltas_geom.cameras.views import PosedViews
@@ -99,3 +100,7 @@ class Diagnosis(NamedTuple):
 
     def __repr__(self) -> str:
         return f"<Diagnosis {self.cause.name}: {self.sentence}>"
+
+
+# torch.load refuses classes that it has not been told of.
+torch.serialization.add_safe_globals([Cause, Diagnosis, Explanation, Mended])
