@@ -126,6 +126,9 @@ def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:
     """The shape to which leading batch dims broadcast; raise ``ShapeError`` where they do not."""
     if torch.compiler.is_compiling():
         return torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
+    if torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
+        # Sizes are tensors there, and no two of these are equal: a trace is for one batch shape.
+        shapes = tuple(tuple(map(int, shape)) for shape in shapes)
     batches = {*shapes} - {()}
     if len(batches) < 2:
         return torch.Size(*batches)

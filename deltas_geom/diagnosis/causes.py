@@ -21,6 +21,7 @@ class Cause(Enum):
     CENTERS_AS_TRANSLATIONS = "translations are the camera centres: t should be -R C"
     K_TRANSPOSED = "K is transposed"
     K_OF_OTHER_SIZE = "K is of images of another size"
+    FOCAL_LENGTH = "focal lengths are those of another lens or zoom"
     HALF_A_PIXEL = "pixels and K differ by half a pixel: centres at 0.5 met centres at 0"
     CROPPED = "pixels are of images cropped since K, or its centre is shifted"
     AXES_SWAPPED = "pixels are (row, column) in the place of (x, y)"
@@ -49,6 +50,7 @@ CURES: dict[Cause, str] = {
     ),
     Cause.K_TRANSPOSED: "PosedViews(K.mT, poses)",
     Cause.K_OF_OTHER_SIZE: "views.resize(old_size=size_of_K, new_size=size_of_images)",
+    Cause.FOCAL_LENGTH: "multiply K[..., :2, :2] by the factor",
     Cause.HALF_A_PIXEL: "add the shift to pixels, or take it from the centres in K",
     Cause.CROPPED: "views.crop(left=left, top=top)",
     Cause.AXES_SWAPPED: "pixels.flip(-1)",

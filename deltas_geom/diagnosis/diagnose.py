@@ -1,5 +1,7 @@
 """Which single cause explains residuals best."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -7,13 +9,25 @@ from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import ShapeError, check_batch, check_kind, check_positive
 from deltas_geom.diagnosis.causes import Cause
-from deltas_geom.diagnosis.evidence import Evidence, displacements, gather_evidence
+from deltas_geom.diagnosis.evidence import SHARE, Evidence, displacements, gather_evidence
 from deltas_geom.diagnosis.hypotheses import Hypothesis, pixels_at, resized, shifted
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.telling import Told
-from deltas_geom.diagnosis.trials import Trial, all_trials, by_camera, explains, level, tried
+from deltas_geom.diagnosis.trials import (
+    Trial,
+    all_trials,
+    by_camera,
+    explains,
+    level,
+    share_fitting,
+    tried,
+)
 
 _SAME = 1.25  # times as much is as good
+# Few matches can be fitted by accident, with a factor or a shift to choose: of a dozen, one wants
+# more than a quarter. Chance has deviations of a share of 0.5 / sqrt(count).
+_CHANCE = 1.2
+_JUDGED_OTHERWISE = (Cause.CAMERA_DISAGREES, Cause.POINTS_AS_VIEWS)  # not by the pairs as given
 
 
 def diagnose(
@@ -21,12 +35,13 @@ def diagnose(
 ) -> Diagnosis:
     """Which single cause explains best why matches do not fit the cameras, and its cure.
 
-    Poses inverted or with OpenGL's axes, rotations or K transposed, K of images of another size,
-    half a pixel, a crop, axes or views of pixels exchanged, one camera with another unit, or one
-    that disagrees with all others: each is mended in turn, for all cameras and for the worst, and
-    residuals are compared. They are distances in px of matches from what a view sees of another
-    view's ray, which ends at the epipole and at infinity, so that points behind cameras count as
-    wrong; a quarter of the matches of a pair of views must fit. So up to 30 % of the pixels may be
+    Poses inverted or with OpenGL's axes, rotations or K transposed, K of images of another size
+    or with wrong focal lengths, half a pixel, a crop, axes or views of pixels exchanged, one camera
+    with another unit, or one that disagrees with all others: each is mended in turn, for all
+    cameras and for the worst, and residuals are compared. They are distances in px of matches from
+    what a view sees of another view's ray, which ends at the epipole and at infinity, so that
+    points behind cameras count as wrong; a quarter of the matches of a pair of views must fit, and
+    more of few matches, of which a quarter fits by accident. So up to 30 % of the pixels may be
     wrong. For people and commands: it looks at values, computes in float64 on the CPU, and has no
     gradients.
 
@@ -80,16 +95,23 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
     told = told._replace(ranking=tuple(trial.explanation() for trial in ranked))
     if chosen is None:
         return _without_cause(told, trials, evidence, threshold)
+    if chosen.what.cause in _JUDGED_OTHERWISE:
+        return told.says(chosen.what, chosen)
+    fitting = partial(share_fitting, evidence=evidence, limit=2 * threshold)
+    share, count = fitting(chosen)
+    if share < SHARE + _CHANCE / count**0.5:
+        return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
     limit = _SAME * float(chosen.residual[chosen.concerned].mean()) + 0.05
     same = [
         trial.explanation()
         for trial in trials
         if trial is not chosen
         and explains(given, trial, threshold)
-        and float(trial.residual[chosen.concerned].mean()) <= limit
+        and (
+            float(trial.residual[chosen.concerned].mean()) <= limit
+            or (trial.what.cause not in _JUDGED_OTHERWISE and fitting(trial)[0] >= share)
+        )
     ]
-    if chosen.what.cause is Cause.CAMERA_DISAGREES:
-        same = []
     return told.says(chosen.what, chosen, tuple(same))
 
 
@@ -146,7 +168,10 @@ def _disagreeing(given: Trial, evidence: Evidence, threshold: float) -> Trial | 
         own, rest = given.residual[concerned], given.residual[~concerned]
         limit = max(threshold, 3 * level(rest))
         apart = level(own) > limit and float((own > limit).double().mean()) > 0.6
-        if apart and _well(rest, evidence.of(~concerned), len(given.what.K), limit):
+        agree = level(rest) <= threshold and _well(
+            rest, evidence.of(~concerned), len(given.what.K), limit
+        )
+        if apart and agree:
             what = given.what._replace(cause=Cause.CAMERA_DISAGREES, cameras=(camera,))
             return Trial(what, torch.where(concerned, torch.nan, given.residual), concerned)
     return None

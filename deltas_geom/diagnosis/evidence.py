@@ -93,9 +93,14 @@ def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHA
         pose: ``(V, 4, 4)`` cam_from_world.
         share: of a pair's matches must be within the distance.
     """
-    off = torch.maximum(*_off(evidence, K, pose).chunk(2))
+    off = distances(evidence, K, pose)
     rank = ((evidence.counts * share).ceil().long() - 1).clamp(min=0)
     return off.sort(dim=-1).values.gather(-1, rank[:, None])[:, 0].clamp(max=CAP)
+
+
+def distances(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
+    """``(P, M)`` px, how far off each match is, in the worse of the pair's views."""
+    return torch.maximum(*_off(evidence, K, pose).chunk(2))
 
 
 def displacements(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:

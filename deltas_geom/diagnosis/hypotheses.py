@@ -67,6 +67,13 @@ def resized(K: Tensor, factor: float) -> Tensor:
     return half.to(K) @ K
 
 
+def zoomed(K: Tensor, factor: float) -> Tensor:
+    """K with focal lengths ``factor`` times as long, and the centre where it is."""
+    changed = K.clone()
+    changed[:, :2, :2] *= factor
+    return changed
+
+
 def pixels_at(slopes: Tensor, K: Tensor) -> Tensor:
     """``(V, N, 2)`` pixels of normalised ones."""
     return (to_homogeneous(slopes) @ K.mT)[..., :2]
@@ -75,6 +82,8 @@ def pixels_at(slopes: Tensor, K: Tensor) -> Tensor:
 def of_all(K: Tensor, pose: Tensor, evidence: Evidence) -> Iterator[Hypothesis]:
     """Causes that concern all cameras."""
     yield from _of(K, pose, evidence, slice(None))
+    zoom = best_size(K, pose, evidence, slice(None), zoomed)
+    yield Hypothesis(Cause.FOCAL_LENGTH, (), zoom, zoomed(K, zoom), pose)
     for shift in (-0.5, 0.5):
         yield Hypothesis(Cause.HALF_A_PIXEL, (), shift, shifted(K, -shift), pose)
 
@@ -108,11 +117,17 @@ def exchanged(K: Tensor, pose: Tensor, one: int, other: int) -> Hypothesis:
     return Hypothesis(Cause.VIEWS_SWAPPED, (one, other), None, K[order], pose[order])
 
 
-def best_size(K: Tensor, pose: Tensor, evidence: Evidence, chosen: slice) -> float:
-    """Factor of the chosen cameras' K with the least residuals."""
+def best_size(
+    K: Tensor,
+    pose: Tensor,
+    evidence: Evidence,
+    chosen: slice,
+    by: Callable[[Tensor, float], Tensor] = resized,
+) -> float:
+    """Factor of the chosen cameras' K, or of their focal lengths, with the least residuals."""
 
     def cost(factor: float) -> float:
-        changed = replaced(K, pose, chosen, resized(K[chosen], factor), pose[chosen])
+        changed = replaced(K, pose, chosen, by(K[chosen], factor), pose[chosen])
         return float(residuals(evidence, *changed).mean())
 
     return _searched(cost, _SIZES, COMMON_SIZES, step=2 ** (1 / 8))

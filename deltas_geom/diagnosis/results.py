@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from deltas_geom.cameras.views import PosedViews
@@ -14,8 +15,8 @@ class Explanation(NamedTuple):
     Attributes:
         cause: ``ALL_WELL`` is what was given.
         cameras: those concerned; empty = all.
-        factor: by which K or the translation is to be multiplied, or the shift that pixels need,
-            px; None for other causes.
+        factor: by which K, its focal lengths or the translation is to be multiplied, or the shift
+            that pixels need, px; None for other causes.
         residual: px, mean over all pairs of views, if the cause were mended.
     """
 
@@ -56,8 +57,8 @@ class Diagnosis(NamedTuple):
         cure: what to do, as code where code can say it.
         camera: the one camera concerned, or the first of two exchanged; None = all.
         cameras: those concerned; empty = all.
-        factor: by which K or the translation is to be multiplied, or the shift that pixels need,
-            px; None for other causes.
+        factor: by which K, its focal lengths or the translation is to be multiplied, or the shift
+            that pixels need, px; None for other causes.
         residual_as_given: px, of the pairs of views that the cause concerns.
         residual_if_mended: px, of the same pairs after the cure; of the others where a camera is
             left out.
@@ -99,3 +100,7 @@ class Diagnosis(NamedTuple):
 
     def __repr__(self) -> str:
         return f"<Diagnosis {self.cause.name}: {self.sentence}>"
+
+
+# torch.load refuses classes that it has not been told of.
+torch.serialization.add_safe_globals([Cause, Diagnosis, Explanation, Mended])

@@ -152,6 +152,8 @@ def _cure(what: Hypothesis, K: Tensor) -> str:
         cure = f"views.crop(left={left:.4g}, top={top:.4g})"
     if what.cause is Cause.K_OF_OTHER_SIZE:
         cure = f"{cure}, the images {what.factor:.4g} times as large as K's"
+    if what.cause is Cause.FOCAL_LENGTH:
+        cure = f"K[..., :2, :2] *= {what.factor:.4g}"
     if what.cause is Cause.UNIT_OF_TRANSLATION:
         cure = f"poses[{what.cameras[0]}, :3, 3] *= {what.factor:.4g}"
     if what.cause is Cause.CAMERA_DISAGREES:

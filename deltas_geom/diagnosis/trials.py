@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.diagnosis.causes import Cause
-from deltas_geom.diagnosis.evidence import Evidence, gather_evidence, residuals
+from deltas_geom.diagnosis.evidence import Evidence, distances, gather_evidence, residuals
 from deltas_geom.diagnosis.hypotheses import Hypothesis, cropped, exchanged, of_all, of_one
 from deltas_geom.diagnosis.results import Explanation
 
@@ -104,6 +104,18 @@ def explains(given: Trial, trial: Trial, threshold: float, *, on: Tensor | None 
     # However large residuals were, what is left must be what cameras leave that fit.
     enough = after <= min(0.25 * before, threshold) and before - after > 0.5 * threshold
     return enough or (before > _EXACT and after <= min(0.1 * before, threshold))
+
+
+def share_fitting(trial: Trial, evidence: Evidence, limit: float) -> tuple[float, int]:
+    """Which share of the matches that a trial concerns is within ``limit`` px, and of how many.
+
+    Of the best four fifths of pairs, as of :func:`level`.
+    """
+    concerned = evidence.of(trial.concerned)
+    off = distances(concerned, trial.what.K, trial.what.pose)
+    shares = (off <= limit).sum(dim=-1) / concerned.counts
+    best = shares.argsort(descending=True)[: -(-4 * len(shares) // 5)]
+    return float(shares[best].mean()), int(concerned.counts[best].sum())
 
 
 def level(residual: Tensor) -> float:

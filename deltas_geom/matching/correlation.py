@@ -265,7 +265,7 @@ def _in_full(
 
 def _masked(values: Tensor, mask: Tensor) -> Tensor:
     """Values in float32 or float64 where the mask is True, elsewhere 0; no derivatives."""
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
         return torch.where(mask, values, 0.0)
     # Eager, torch.where branches at each number: half the time of the sampling itself. Here all
     # bits of a number are kept, or none.

@@ -29,8 +29,9 @@ def recomputed(
 ) -> tuple[Tensor, ...]:
     """``function(*tensors)``, keeping nothing but ``tensors`` for its backward pass.
 
-    Under ``torch.compile``, ``torch.export``, the transforms of ``torch.func`` and in forward
-    mode the function is called as it is: they derive and keep what they need by themselves.
+    Under ``torch.compile``, ``torch.export``, ``torch.jit.trace``, the transforms of
+    ``torch.func`` and in forward mode the function is called as it is: they derive and keep what
+    they need by themselves.
 
     Args:
         function: pure, from tensors to a tuple of tensors; outputs that are not of floating
@@ -52,7 +53,8 @@ def recomputed(
         >>> torch.autograd.grad(y.sum(), x)[0].allclose((x.exp().cos() * x.exp()))
         True
     """
-    if transformed(*tensors):
+    # A trace would hold chunks of so many points as it was made with, and no Function of ours.
+    if transformed(*tensors) or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
         return function(*tensors)
     values = function if values is None else values
     compiling = torch.compiler.is_compiling()

@@ -97,5 +97,6 @@ def _of_call(
 
 
 def _version_of(tensor: Tensor) -> int | None:
-    """How often it was changed in place; None where torch does not count."""
-    return None if torch.compiler.is_compiling() or tensor.is_inference() else tensor._version
+    """How often it was changed in place; None where torch does not count or a trace looks on."""
+    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[no-untyped-call,attr-defined]
+    return None if traced or tensor.is_inference() else tensor._version

@@ -75,6 +75,12 @@ def of_another_size(K: Tensor, factor: float) -> Tensor:
     return changed
 
 
+def with_focal_lengths(K: Tensor, factor: float) -> Tensor:
+    changed = K.clone()
+    changed[:, :2, :2] *= factor
+    return changed
+
+
 def transposed(pose: Tensor) -> Tensor:
     changed = pose.clone()
     changed[:, :3, :3] = pose[:, :3, :3].mT
@@ -124,6 +130,7 @@ GLOBAL: dict[Cause, Fault] = {
     ),
     Cause.K_TRANSPOSED: lambda K, T, x: (K.mT, T, x),
     Cause.K_OF_OTHER_SIZE: lambda K, T, x: (of_another_size(K, 2.0), T, x),
+    Cause.FOCAL_LENGTH: lambda K, T, x: (with_focal_lengths(K, 1.6), T, x),
     Cause.CROPPED: lambda K, T, x: (K, T, x - torch.tensor([160.0, 120.0])),
     Cause.PIXELS_NORMALIZED: lambda K, T, x: (K, T, rays_of(K, x)[..., :2]),
     Cause.AXES_SWAPPED: lambda K, T, x: (K, T, x.flip(-1)),

@@ -12,6 +12,7 @@ from operations import RECORDS, chosen, followed, inputs_in, is_real, tensors_of
 from torch.utils.data import default_collate
 
 import deltas_geom as geom
+from deltas_geom.testing import seeded_scene
 
 HALF = (torch.float16, torch.bfloat16)
 
@@ -108,3 +109,16 @@ def test_posed_views_of_arrays_are_refused_at_once() -> None:
         geom.triangulate(views, torch.zeros(1, 5, 2))
     with pytest.raises(TypeError, match=r"views must be PosedViews, got Tensor"):
         geom.project(views.proj, torch.zeros(5, 3))
+
+
+def test_lenses_and_diagnoses_come_back_from_files() -> None:
+    """No records, but kept beside checkpoints as these are."""
+    views, _, pixels = seeded_scene(1, num_views=3, num_points=9)
+    lens = geom.Lens.from_opencv(views.K, torch.tensor([-0.1, 0.02, 0.0, 0.0]).expand(3, 4))
+    found = geom.diagnose(views, pixels)
+    file = io.BytesIO()
+    torch.save({"lens": lens, "diagnosis": found}, file)
+    file.seek(0)
+    loaded = torch.load(file)
+    assert loaded["lens"].model == lens.model and torch.equal(loaded["lens"].K, lens.K)
+    assert loaded["diagnosis"].cause is found.cause and str(loaded["diagnosis"]) == str(found)

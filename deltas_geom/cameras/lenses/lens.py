@@ -223,3 +223,7 @@ class Lens:
     def dtype(self) -> torch.dtype:
         """Of K."""
         return self.K.dtype
+
+
+# torch.load refuses classes that it has not been told of.
+torch.serialization.add_safe_globals([Lens])

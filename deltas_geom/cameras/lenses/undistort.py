@@ -129,7 +129,8 @@ def undistort_image(
         raise ShapeError(f"image ends in channels, {tuple(image.shape)}: use image.movedim(-1, -3)")
     if not 0 <= alpha <= 1:
         raise ValueError(f"alpha must be from 0 (all seen) to 1 (all kept), got {alpha}")
-    old_size = (image.shape[-2], image.shape[-1])
+    # In a trace sizes are tensors, which would divide in float32.
+    old_size = (int(image.shape[-2]), int(image.shape[-1]))
     new_size = old_size if new_size is None else new_size
     check_image_size(old_size)
     check_image_size(new_size)
@@ -153,7 +154,7 @@ def _remapped(
     new_K = view(lens) if new_K is None else new_K
     check_shapes(new_K=(new_K, "3 3"))
     batch = batch_shape(image.shape[:-3], K.shape[:-2], coefficients.shape[:-1], new_K.shape[:-2])
-    old_size = (image.shape[-2], image.shape[-1])
+    old_size = (int(image.shape[-2]), int(image.shape[-1]))
     grid = pixel_grid(
         new_size, device=new_K.device, dtype=torch.promote_types(new_K.dtype, K.dtype)
     )
@@ -174,7 +175,8 @@ def pinhole_K(
 
     Source: OpenCV's ``getOptimalNewCameraMatrix``, with more of the border looked at.
     """
-    x, y = _border_slopes(lens, old_size).unbind(dim=-1)
+    # A trace knows nothing of no_grad.
+    x, y = _border_slopes(lens.detach(), old_size).unbind(dim=-1)
     # Sides in order: left, right, top, bottom.
     inner = [
         x[..., 0, :].amax(-1),
