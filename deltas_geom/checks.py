@@ -122,11 +122,16 @@ def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:
     return batch_shape(*(x.shape[: x.ndim - len(spec.split())] for x, spec in given.values()))
 
 
+def tracing() -> bool:
+    """Does ``torch.jit.trace`` look on?"""
+    return bool(torch.jit.is_tracing())  # type: ignore[no-untyped-call,attr-defined]
+
+
 def batch_shape(*shapes: tuple[int, ...]) -> torch.Size:
     """The shape to which leading batch dims broadcast; raise ``ShapeError`` where they do not."""
     if torch.compiler.is_compiling():
         return torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
-    if torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
+    if tracing():
         # Sizes are tensors there, and no two of these are equal: a trace is for one batch shape.
         shapes = tuple(tuple(map(int, shape)) for shape in shapes)
     batches = {*shapes} - {()}

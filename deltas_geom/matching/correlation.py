@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import normalizing
-from deltas_geom.checks import batch_shape, check_bool, check_shapes
+from deltas_geom.checks import batch_shape, check_bool, check_shapes, tracing
 from deltas_geom.epipolar.sampling import Samples
 from deltas_geom.matching.lengths import inverse_lengths, length_table
 from deltas_geom.numerics.arithmetic import (
@@ -265,7 +265,7 @@ def _in_full(
 
 def _masked(values: Tensor, mask: Tensor) -> Tensor:
     """Values in float32 or float64 where the mask is True, elsewhere 0; no derivatives."""
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
+    if torch.compiler.is_compiling() or tracing():
         return torch.where(mask, values, 0.0)
     # Eager, torch.where branches at each number: half the time of the sampling itself. Here all
     # bits of a number are kept, or none.

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.nn import Parameter
 
+from deltas_geom.checks import tracing
 from deltas_geom.records import mapped, tensors_of
 
 _Arguments = ParamSpec("_Arguments")
@@ -171,7 +172,7 @@ def values_at_hand(tensor: Tensor) -> bool:
 
     In forward mode they have tangents, which are lost where values leave torch.
     """
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
+    if torch.compiler.is_compiling() or tracing():
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return False

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from deltas_geom.checks import tracing
 from deltas_geom.numerics.chunks import Cut, chunks, joined
 
 Function = Callable[..., tuple[Tensor, ...]]
@@ -54,7 +55,7 @@ def recomputed(
         True
     """
     # A trace would hold chunks of so many points as it was made with, and no Function of ours.
-    if transformed(*tensors) or torch.jit.is_tracing():  # type: ignore[no-untyped-call,attr-defined]
+    if transformed(*tensors) or tracing():
         return function(*tensors)
     values = function if values is None else values
     compiling = torch.compiler.is_compiling()

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_shapes
+from deltas_geom.checks import check_shapes, tracing
 from deltas_geom.numerics.arithmetic import at_least_single, without_autocast
 from deltas_geom.triangulation.equations import Frame, check_settings
 from deltas_geom.triangulation.results import Triangulation
@@ -98,5 +98,5 @@ def _of_call(
 
 def _version_of(tensor: Tensor) -> int | None:
     """How often it was changed in place; None where torch does not count or a trace looks on."""
-    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[no-untyped-call,attr-defined]
-    return None if traced or tensor.is_inference() else tensor._version
+    looked_on = torch.compiler.is_compiling() or tracing()
+    return None if looked_on or tensor.is_inference() else tensor._version
