@@ -30,9 +30,9 @@ from deltas_geom.triangulation.observed import (
     homogeneous_in_views,
     observe,
 )
-from deltas_geom.triangulation.robust_loss import Loss, robust_loss
+from deltas_geom.triangulation.robust_loss import Loss, robust_loss, second_derivative
 
-_Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
+_Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
 _Descent = Callable[["_Problem", int], _End]
 _FARTHEST = 1e10  # px: a projection farther out than this is as good as behind the camera
@@ -180,6 +180,7 @@ class _Fit(NamedTuple):
         offset: x and y ``(*B, V, N)`` px, from the pixels to there.
         inverse: ``(*B, V, N)`` 1 / depth.
         influence: ``(*B, V, N)`` rho', or () if all alike.
+        bend: ``(*B, V, N)`` 2 rho'', or ().
         error: ``(*B, N)`` px^2, weighted sum of the squared distances.
         cost: ``(*B, N)`` px^2, of the loss, without gradient; infinite if not in front of all.
     """
@@ -188,6 +189,7 @@ class _Fit(NamedTuple):
     offset: tuple[Tensor, Tensor]
     inverse: Tensor
     influence: Tensor
+    bend: Tensor
     error: Tensor
     cost: Tensor
 
@@ -205,12 +207,12 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
     dx, dy = x - px, y - py
     distance = torch.addcmul(dx * dx, dy, dy)
     error = (observed.weights.squared * distance).sum(dim=-2)
-    rho, influence = problem.robust(distance)
+    rho, influence, bend = problem.robust(distance)
     with torch.no_grad():
         behind = ((depth - c) * observed.weights.used).sum(dim=-2) > 0
         cost = error if rho is distance else (observed.weights.squared * rho).sum(dim=-2)
     cost = torch.where(behind, torch.inf, cost.detach())
-    return _Fit((x, y), (dx, dy), inverse, influence, error, cost)
+    return _Fit((x, y), (dx, dy), inverse, influence, bend, error, cost)
 
 
 def _descend(problem: _Problem, steps: int) -> _End:
@@ -265,20 +267,16 @@ def _descend_implicitly(problem: _Problem, steps: int) -> _End:
     They are -H^-1 dg with the cost's whole second derivative H. Gauss-Newton's normal matrix,
     which leaves out how residuals and losses bend, would be wrong by their share.
     """
-
-    def downhill(*points: Tensor) -> Vector3:
-        return _normal_equations(problem, _fit(problem, points))[1]
-
     with torch.no_grad():
         end, _, valid = _descend(problem, steps)
-        end = tuple(component.detach() for component in end)  # no_grad leaves tangents
-        _, pull, *_ = torch.func.vjp(downhill, *end)
-        none, one = torch.zeros_like(end[0]), torch.ones_like(end[0])
-        (a, b, c), (_, d, e), (_, _, f) = map(
-            pull, ((one, none, none), (none, one, none), (none, none, one))
-        )
-        hessian = tuple(-entry.detach() for entry in (a, b, c, d, e, f))
-    change, strict = solve3_scaled(hessian, downhill(*end))
+    end = tuple(component.detach() for component in end)
+    fit = _fit(problem, end)
+    normal, right = _normal_equations(problem, fit)
+    seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
+    with torch.no_grad():
+        counted = squared * fit.influence, squared * fit.bend
+        hessian = second_derivative(normal, problem.proj, *seen, *counted)
+    change, strict = solve3_scaled(tuple(entry.detach() for entry in hessian), right)
     points = tuple(
         # A gradient of 0 to the start, not a missing one; of the step no value.
         p + 0 * s + torch.where(strict & valid, d - d.detach(), 0.0)
