@@ -1,6 +1,7 @@
 """Exported networks give the depth of the network, whatever images and cameras they get."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import NamedTuple
 import pytest
 import torch
 from exported_depth import CPU, SIZE, assert_same_depth, needs_extra, room
+from filelock import FileLock
 from torch import Tensor
 
 from deltas_nets.config import NetworkConfig
@@ -43,7 +45,6 @@ class Exported(NamedTuple):
         return found
 
 
-# Each takes most of a minute to export.
 @pytest.fixture(
     scope="module",
     params=[
@@ -51,12 +52,27 @@ class Exported(NamedTuple):
         pytest.param(2, id="2 views", marks=pytest.mark.slow),
     ],
 )
-def exported(request: pytest.FixtureRequest) -> Exported:
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     needs_extra()
     model, config = load_model(), ExportConfig(request.param, 64, SIZE)
-    program, metadata = trace(model, config), metadata_of(model, config, {"step": "7"})
-    onnx, saved = onnx_bytes(program, metadata, Path("x.onnx")), program_bytes(program, metadata)
-    return Exported(model, config, onnx, onnx_runner(onnx), saved, program_runner(saved, CPU))
+    onnx, program = files_of(model, config, tmp_path_factory.getbasetemp())
+    return Exported(model, config, onnx, onnx_runner(onnx), program, program_runner(program, CPU))
+
+
+def files_of(model: Deltas, config: ExportConfig, folder: Path) -> tuple[bytes, bytes]:
+    """The network as ONNX and as a program, made once for all processes of a run.
+
+    It takes most of a minute.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    files = folder / f"{config.num_views}.onnx", folder / f"{config.num_views}.pt2"
+    with FileLock(folder / f"export {config.num_views}.lock"):
+        if not files[1].exists():
+            graph, metadata = trace(model, config), metadata_of(model, config, {"step": "7"})
+            files[0].write_bytes(onnx_bytes(graph, metadata, Path("x.onnx")))
+            files[1].write_bytes(program_bytes(graph, metadata))
+    return files[0].read_bytes(), files[1].read_bytes()
 
 
 def test_shapes_are_as_documented(exported: Exported) -> None:

@@ -124,7 +124,7 @@ def test_what_it_cannot_do_is_one_line_and_nothing_is_written(
     assert_one_line(run("demo", "--weights", checkpoint, "--out", out), "use deltas depth")
     assert_one_line(run(*base, "--precision", "bfloat16"), "float32 alone", "leave it out")
     exported = run("export", "--weights", checkpoint, "--out", tmp_path / "a.onnx")
-    assert_one_line(exported, "the reference network", "name weights of deltas train")
+    assert_one_line(exported, "no network of deltas train", "name deltas-small")
     assert not out.exists()
 
 
