@@ -118,11 +118,18 @@ def is_good(status: Tensor, good: tuple[Status, ...]) -> Tensor:
 
 
 def gradients(loss: Callable[..., Tensor], inputs: list[Tensor]) -> list[Tensor]:
-    """By each of the inputs; 0 where the loss does not depend on it."""
+    """By each of the inputs; 0 where the loss does not depend on it.
+
+    Raises:
+        AssertionError: autograd does not know that it depends on any.
+    """
     leaves = [value.detach().clone().requires_grad_() for value in inputs]
     total = loss(*leaves)
     if not total.requires_grad:
-        return [torch.zeros_like(value) for value in inputs]
+        raise AssertionError(
+            "no gradient: autograd does not go through the answer (a detach, or NumPy inside?); "
+            "if none is meant, say differentiable=False"
+        )
     found = torch.autograd.grad(total, leaves, allow_unused=True)
     pairs = zip(inputs, found, strict=True)
     return [torch.zeros_like(value) if grad is None else grad for value, grad in pairs]
