@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from hypothesis import given
-from wrong import OURS, after, ours
+from wrong import OURS, after, before, ours
 
 from deltas_geom.testing import (
     INVARIANTS,
@@ -164,3 +164,14 @@ def test_what_ours_answers_is_in_order(scene: PosedScene) -> None:
     assert answers.project is not None
     pixels = answers.project(scene.views.K, scene.views.cam_from_world, scene.points)
     assert pixels.dtype == torch.float64
+
+
+@given(scene=posed_scenes())
+def test_the_square_of_weights_is_seen_in_two_views_of_any_scene(scene: PosedScene) -> None:
+    heeded = INVARIANTS["twice_the_weight_is_a_quarter_of_the_error"]
+    heeded(OURS, scene)
+    for tolerance in (1e-6, 3e-3):
+        for power in (0.0, 0.5):
+            wrong = before("mine", "triangulate", lambda p, x, w, power=power: (p, x, w**power))
+            with pytest.raises(AssertionError, match=r"^[12]\.?\d* instead of 4 at "):
+                heeded(replace(wrong, max_views=2, tolerance=tolerance), scene)

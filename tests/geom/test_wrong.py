@@ -85,6 +85,7 @@ FOUND = {
         "uncentred | half the spread | spread of the pixel"
     ),
     "the_covariance_does_not_know_where_it_is": "uncentred | spread of the pixel",
+    "what_is_masked_has_no_spread": "spread of all | uncentred",
     "the_soft_argmax_of_a_heatmap_peak_is_its_pixel": (
         "heatmap y, x | heatmap from the corner | heatmap normalised"
     ),
@@ -101,6 +102,10 @@ FOUND = {
     "only_the_ratios_of_weights_count": "weights plus 0.1",
     "a_view_of_weight_0_is_a_view_removed": "weights ignored | weights plus 0.1",
     "a_doubled_view_is_a_doubled_squared_weight": "weights ignored | weights plus 0.1",
+    "twice_the_weight_is_a_quarter_of_the_error": (
+        "weights ignored | weights ignored, pair | weights not squared | weights plus 0.1 | "
+        "1 mm off | pixels stretched"
+    ),
     "a_batch_of_scenes_is_solved_as_each_alone": "first of batch",
     "float32_is_as_good_as_rounding_the_input": "float16",
     "gradients_are_finite_differences": "no gradient",
@@ -126,6 +131,7 @@ FOUND = {
     "a_wrong_view_does_not_move_a_robust_point": (
         "all views | no second look | none right | robust, 1 mm off"
     ),
+    "a_view_of_weight_0_does_not_move_a_robust_point": "robust, no weights | robust, 1 mm off",
     "inliers_are_within_the_threshold": "all views",
     "robust_points_move_with_the_world": "robust, 1 mm off",
     "the_nearest_point_wins": (

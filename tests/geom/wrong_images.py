@@ -98,6 +98,7 @@ WRONG = [
     before("no mask", "soft_argmax", lambda x, p, mask: (x, p, torch.ones_like(mask))),
     Target("exp", soft_argmax=unguarded_argmax),
     Target("uncentred", soft_covariance=uncentred),
+    before("spread of all", "soft_covariance", lambda x, p, m: (x, p, torch.ones_like(m))),
     after("half the spread", "soft_covariance", lambda found: found / 2),
     after("spread of the pixel", "soft_covariance", lambda c: c + torch.eye(len(c)) / 12),
     after("heatmap y, x", "heatmap_argmax", lambda pixel: pixel.flip(-1)),

@@ -95,6 +95,21 @@ def the_covariance_does_not_know_where_it_is(
     assert_near(found, wanted, VALUE_TOLERANCE * 1000, "(position squared)")
 
 
+@invariant("soft_covariance", scenes="scores")
+def what_is_masked_has_no_spread(target: Target, scene: ScoreScene) -> None:
+    """A masked place counts as one that is not there, whatever its logit and position, also NaN."""
+    mask = scene.mask.flatten().clone()
+    mask[0], mask[-1] = False, True
+    logits, positions = scene.logits.flatten(), scene.positions
+    assert target.soft_covariance is not None
+    wanted = target.soft_covariance(logits[mask], positions[mask], mask[mask])
+    for junk in (1e9, torch.nan):
+        found = target.soft_covariance(
+            torch.where(mask, logits, junk), torch.where(mask[:, None], positions, junk), mask
+        )
+        assert_near(found, wanted, VALUE_TOLERANCE * 1000, "(position squared)")
+
+
 @invariant("heatmap_argmax", scenes="scores")
 def the_soft_argmax_of_a_heatmap_peak_is_its_pixel(target: Target, scene: ScoreScene) -> None:
     """All probability in one pixel gives its (x, y), the top-left one being (0, 0)."""
