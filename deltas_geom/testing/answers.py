@@ -82,7 +82,14 @@ def checked(target: str, feature: str, function: Function, remarks: list[str]) -
 
     def answer(arguments: tuple[Any, ...]) -> list[Tensor]:
         copies = _copies(arguments)
-        parts = _tensors(where, function(*copies), returns)
+        try:
+            found = function(*copies)
+        except RuntimeError as error:
+            # Torch's own words, "use detach", lead to an answer without a gradient.
+            if "numpy() on Tensor that requires grad" in str(error):
+                remarks.append(f"{feature} uses NumPy: give the target differentiable=False")
+            raise
+        parts = _tensors(where, found, returns)
         _check_arguments(where, takes, arguments, copies)
         _check_shapes(where, takes, arguments, parts, returns)
         _check_dtypes(where, arguments, parts, returns)

@@ -23,6 +23,7 @@ Drawer = Callable[[Tensor, Tensor, Tensor, ImageSize], tuple[Tensor, Tensor]]
 _SOLVERS = "triangulate, judge, refine, residual or robust"
 _MADE_OF = {
     "weights": f"weighted=True and {_SOLVERS}",
+    "autograd": "differentiable=True",
     "gradients": "triangulate and differentiable=True",
     "batches": "triangulate and batched=True",
     "many views": f"max_views of 3 or more, or None, and {_SOLVERS}",
@@ -54,7 +55,8 @@ class Target:
         max_views: the most views that ``triangulate``, ``judge``, ``refine``, ``residual``,
             ``parallax`` and ``robust`` take; None = any number.
         weighted: whether they heed weights; if not, they are called with None.
-        differentiable: whether autograd goes through ``triangulate``.
+        differentiable: whether autograd goes through ``triangulate``, ``project`` and
+            ``soft_argmax``.
         batched: whether ``triangulate`` takes leading batch dims, broadcast against each other.
         judge: as ``triangulate``, but ``-> status (N)`` of the points.
         refine: ``(proj (V, 3, 4), pixels (V, N, 2), points (N, 3), weights (V, N) or None) ->
@@ -164,12 +166,13 @@ class Target:
         Args:
             feature: the name of a function above, or of what goes with some of them: "weights"
                 and "many views" (three and more) of what has points and pixels, "gradients" and
-                "batches" of triangulation, "samples" (of either spacing), "drawing" (of depth, in
-                any of three ways).
+                "batches" of triangulation, "autograd" of anything, "samples" (of either spacing),
+                "drawing" (of depth, in any of three ways).
         """
         solves = any((self.triangulate, self.judge, self.refine, self.residual, self.robust))
         more = {
             "weights": solves and self.weighted,
+            "autograd": self.differentiable,
             "gradients": self.triangulate is not None and self.differentiable,
             "batches": self.triangulate is not None and self.batched,
             "many views": solves and (self.max_views is None or self.max_views >= 3),

@@ -133,6 +133,13 @@ def test_a_detached_answer_is_told_of_the_field_that_says_so() -> None:
         INVARIANTS["gradients_are_finite_differences"](detached, seeded_scene(0))
 
 
+def test_numpy_under_autograd_is_told_of_that_field_too() -> None:
+    inside = after("mine", "project", lambda pixels: torch.from_numpy(pixels.numpy()))
+    outcome = check("gradients_of_pixels_are_finite_differences", inside)
+    assert "project uses NumPy: give the target differentiable=False" in outcome.example
+    assert check("pixels_are_finite", inside).result == "pass"
+
+
 def test_a_scene_survives_what_writes_into_it() -> None:
     scene = seeded_scene(0)
     with pytest.raises(AssertionError, match="writes into"):

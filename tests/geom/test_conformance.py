@@ -234,7 +234,8 @@ def test_a_field_is_a_function_and_returns_tensors(name: str) -> None:
     def in_numpy(*arguments: Any) -> Any:
         found = function(*arguments)
         several = isinstance(found, tuple)
-        return tuple(part.numpy() for part in found) if several else found.numpy()
+        parts = tuple(part.detach().numpy() for part in (found if several else (found,)))
+        return parts if several else parts[0]
 
     def too_many(*arguments: Any) -> Any:
         found = function(*arguments)

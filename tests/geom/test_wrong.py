@@ -28,6 +28,7 @@ FOUND = {
     "pixels_are_those_of_the_camera_equations": "projected at 0.5 | whole mm",
     "pixels_do_not_know_the_worlds_frame": "whole mm",
     "pixels_follow_a_crop_and_a_resize": "projected at 0.5",
+    "gradients_of_pixels_are_finite_differences": "half the gradient | whole mm",
     "pixels_are_finite": "unguarded",
     "a_pixel_with_its_depth_is_its_point": "world_from_cam | along the ray | unprojected at 0.5",
     "unprojected_points_move_with_the_world": "world_from_cam",
@@ -80,6 +81,7 @@ FOUND = {
     "the_soft_argmax_moves_with_the_positions": "argmax + 1e-3",
     "what_is_masked_does_not_count": "no mask",
     "the_soft_argmax_is_finite": "exp",
+    "gradients_of_the_soft_argmax_are_finite_differences": "logits detached",
     "the_covariance_of_a_delta_is_0": "uncentred | spread of the pixel",
     "the_covariance_of_two_places_is_their_distance": (
         "uncentred | half the spread | spread of the pixel"

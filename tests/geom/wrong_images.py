@@ -96,6 +96,7 @@ WRONG = [
     before("half as warm", "soft_argmax", lambda x, p, mask: (2 * x, p, mask)),
     after("argmax + 1e-3", "soft_argmax", lambda found: 1.001 * found),
     before("no mask", "soft_argmax", lambda x, p, mask: (x, p, torch.ones_like(mask))),
+    before("logits detached", "soft_argmax", lambda x, p, mask: (x.detach(), p, mask)),
     Target("exp", soft_argmax=unguarded_argmax),
     Target("uncentred", soft_covariance=uncentred),
     before("spread of all", "soft_covariance", lambda x, p, m: (x, p, torch.ones_like(m))),

@@ -4,7 +4,12 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import pixel_grid
-from deltas_geom.testing.agreement import VALUE_TOLERANCE, assert_finite, assert_near
+from deltas_geom.testing.agreement import (
+    VALUE_TOLERANCE,
+    assert_finite,
+    assert_gradients,
+    assert_near,
+)
 from deltas_geom.testing.planar import ScoreScene
 from deltas_geom.testing.registry import invariant
 from deltas_geom.testing.target import Target
@@ -65,6 +70,17 @@ def the_soft_argmax_is_finite(target: Target, scene: ScoreScene) -> None:
         assert_finite(_position(target, scene._replace(logits=factor * scene.logits)), "position")
     nothing = scene._replace(mask=torch.zeros_like(scene.mask))
     assert_finite(_position(target, nothing), "position where all is masked,")
+
+
+@invariant("soft_argmax", "autograd", scenes="scores")
+def gradients_of_the_soft_argmax_are_finite_differences(target: Target, scene: ScoreScene) -> None:
+    """The gradient by logits and positions is finite and that of finite differences."""
+
+    def mean(logits: Tensor, positions: Tensor) -> Tensor:
+        return _position(target, scene._replace(logits=logits, positions=positions))
+
+    inputs = [scene.logits, scene.positions]
+    assert_gradients(mean, inputs, ("logits", "positions"), "(position)")
 
 
 @invariant("soft_covariance", scenes="scores")
