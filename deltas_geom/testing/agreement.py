@@ -1,6 +1,6 @@
 """How invariants compare: assertions that print the failing numbers, and derivatives."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -118,14 +118,49 @@ def is_good(status: Tensor, good: tuple[Status, ...]) -> Tensor:
 
 
 def gradients(loss: Callable[..., Tensor], inputs: list[Tensor]) -> list[Tensor]:
-    """By each of the inputs; 0 where the loss does not depend on it."""
+    """By each of the inputs; 0 where the loss does not depend on it.
+
+    Raises:
+        AssertionError: autograd does not know that it depends on any.
+    """
     leaves = [value.detach().clone().requires_grad_() for value in inputs]
     total = loss(*leaves)
     if not total.requires_grad:
-        return [torch.zeros_like(value) for value in inputs]
+        raise AssertionError(
+            "no gradient: autograd does not go through the answer (a detach, or NumPy inside?); "
+            "if none is meant, say differentiable=False"
+        )
     found = torch.autograd.grad(total, leaves, allow_unused=True)
     pairs = zip(inputs, found, strict=True)
     return [torch.zeros_like(value) if grad is None else grad for value, grad in pairs]
+
+
+def assert_gradients(
+    function: Callable[..., Tensor], inputs: list[Tensor], names: Iterable[str], unit: str
+) -> None:
+    """The gradient by each input is finite and that of finite differences, relative to its size.
+
+    Args:
+        function: of the inputs.
+        inputs: where.
+        names: of the inputs, for the message; there may be more.
+        unit: of what the function returns.
+    """
+
+    def loss(*values: Tensor) -> Tensor:
+        found = function(*values)
+        # Different factors, so that no two errors cancel.
+        return (found * torch.linspace(1, 2, found.numel()).to(found).reshape(found.shape)).sum()
+
+    for value, found, name in zip(inputs, gradients(loss, inputs), names, strict=False):
+        # Relative steps, so that entries of all units get an effect of one size; longer where the
+        # target's rounding would drown it.
+        size = value.abs().clamp(min=1)
+        wanted = differences(loss, inputs, value, 1e-5 * slack() ** 0.5 * size)
+        tolerance = 1e-5 + 1e-4 * float((wanted * size).abs().max())
+        assert_near(
+            found * size, wanted * size, tolerance, f"{unit} (gradient by {name}, relative)"
+        )
 
 
 def differences(

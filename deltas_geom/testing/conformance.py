@@ -42,7 +42,9 @@ def check(name: str, target: Target) -> Outcome:
             kind = "" if isinstance(error, AssertionError) else f"{type(error).__name__}: "
             if isinstance(scene, PosedScene):
                 scene = first_views(scene, target.max_views)
-            example = f"{_call(make)}: {kind}{error}\n{scene.sketch()}"
+            # The last note is the theorem and the sketch, which the table has elsewhere.
+            remarks = getattr(error, "__notes__", [])[:-1]
+            example = "\n".join([f"{_call(make)}: {kind}{error}", *remarks, scene.sketch()])
             return Outcome(name, target.name, "FAIL", example)
     return Outcome(name, target.name, "pass")
 

@@ -54,9 +54,11 @@ class Invariant:
         """Check it in the views of the scene that the target can take.
 
         Raises:
-            AssertionError: the invariant does not hold; with the failing numbers.
+            AssertionError: the invariant does not hold, with the failing numbers; or an answer
+                is of another shape or dtype, is not the same twice, or an argument was changed.
             TypeError: a scene of another kind, or a function of the target returns no tensor.
-            ValueError: the target does not offer what is needed, or the scene has too few views.
+            ValueError: the target does not offer what is needed, or the scene has too few views,
+                batch dims, or other pixels than views and points.
         """
         name = self.check.__name__
         if not isinstance(target, Target):
@@ -68,12 +70,33 @@ class Invariant:
         if not isinstance(scene, kind):
             raise TypeError(f"{name} takes a {kind.__name__}, got {type(scene).__name__}")
         if isinstance(scene, PosedScene):
+            _check_scene(name, scene)
             views = scene.views.num_views
             if views < self.least_views:
                 raise ValueError(f"{name} needs a scene of {self.least_views} views, got {views}")
             scene = first_views(scene, target.max_views)
-        with allowing(target.tolerance):
-            self.check(target.checked(), scene, **choices)
+        remarks: list[str] = []
+        try:
+            with allowing(target.tolerance):
+                self.check(target.checked(remarks), scene, **choices)
+        except Exception as error:
+            # Notes, so that a raw traceback or hypothesis says, too, what was asked of what.
+            for remark in remarks:
+                error.add_note(remark)
+            error.add_note(f"{target.name}: {self.theorem} ({name})\n{scene.sketch()}")
+            raise
+
+
+def _check_scene(name: str, scene: PosedScene) -> None:
+    views, points, pixels = scene
+    count = points.shape[0] if points.dim() == 2 else 0
+    wanted = (views.num_views, count, 2)
+    if points.dim() != 2 or pixels.shape != wanted or views.K.dim() != 3:
+        raise ValueError(
+            f"{name} takes a scene without batch dims: points (N, 3), pixels (V, N, 2), "
+            f"K (V, 3, 3), got {tuple(points.shape)}, {tuple(pixels.shape)}, "
+            f"{tuple(views.K.shape)}"
+        )
 
 
 class _ByName(dict[str, Invariant]):

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
+
+from deltas_geom.testing.answers import SIGNATURES, checked
 
 ImageSize = tuple[int, int]
 """(height, width)."""
@@ -19,35 +20,10 @@ Sampler = Callable[
 ]
 Drawer = Callable[[Tensor, Tensor, Tensor, ImageSize], tuple[Tensor, Tensor]]
 
-_SAMPLES = ("pixels (N, S, 2)", "inv_depth (N, S)", "status (N)")
-_IMAGES = ("depth (H, W)", "weight (H, W)")
-_RETURNS: dict[str, tuple[str, ...]] = {
-    "project": ("pixels (V, N, 2)",),
-    "fundamental": ("F (3, 3)",),
-    "triangulate": ("points (N, 3)",),
-    "judge": ("status (N)",),
-    "refine": ("points (N, 3)",),
-    "segments": ("far (N, 2)", "near (N, 2)", "status (N)"),
-    "depth_samples": _SAMPLES,
-    "pixel_samples": _SAMPLES,
-    "sweep": ("pixels (N, S, 2)", "visible (N, S) bool"),
-    "sample_map": ("features (N, D)",),
-    "correlate": ("scores (N, S)",),
-    "soft_argmax": ("position (D)",),
-    "soft_covariance": ("covariance (D, D)",),
-    "heatmap_argmax": ("pixel (2)",),
-    "rasterize": ("depth (H, W)",),
-    "mean_depth": _IMAGES,
-    "splat": _IMAGES,
-    "unproject": ("points (V, N, 3)",),
-    "rays": ("rays (V, N, 3)",),
-    "residual": ("residual (N)",),
-    "parallax": ("angle (N)",),
-    "robust": ("points (N, 3)", "inliers (V, N) bool"),
-}
 _SOLVERS = "triangulate, judge, refine, residual or robust"
 _MADE_OF = {
     "weights": f"weighted=True and {_SOLVERS}",
+    "autograd": "differentiable=True",
     "gradients": "triangulate and differentiable=True",
     "batches": "triangulate and batched=True",
     "many views": f"max_views of 3 or more, or None, and {_SOLVERS}",
@@ -79,7 +55,8 @@ class Target:
         max_views: the most views that ``triangulate``, ``judge``, ``refine``, ``residual``,
             ``parallax`` and ``robust`` take; None = any number.
         weighted: whether they heed weights; if not, they are called with None.
-        differentiable: whether autograd goes through ``triangulate``.
+        differentiable: whether autograd goes through ``triangulate``, ``project`` and
+            ``soft_argmax``.
         batched: whether ``triangulate`` takes leading batch dims, broadcast against each other.
         judge: as ``triangulate``, but ``-> status (N)`` of the points.
         refine: ``(proj (V, 3, 4), pixels (V, N, 2), points (N, 3), weights (V, N) or None) ->
@@ -166,7 +143,7 @@ class Target:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise TypeError(f"name must be a str, got {type(self.name).__name__}")
-        for field in _RETURNS:
+        for field in SIGNATURES:
             function = getattr(self, field)
             if function is not None and not callable(function):
                 kind = type(function).__name__
@@ -189,12 +166,13 @@ class Target:
         Args:
             feature: the name of a function above, or of what goes with some of them: "weights"
                 and "many views" (three and more) of what has points and pixels, "gradients" and
-                "batches" of triangulation, "samples" (of either spacing), "drawing" (of depth, in
-                any of three ways).
+                "batches" of triangulation, "autograd" of anything, "samples" (of either spacing),
+                "drawing" (of depth, in any of three ways).
         """
         solves = any((self.triangulate, self.judge, self.refine, self.residual, self.robust))
         more = {
             "weights": solves and self.weighted,
+            "autograd": self.differentiable,
             "gradients": self.triangulate is not None and self.differentiable,
             "batches": self.triangulate is not None and self.batched,
             "many views": solves and (self.max_views is None or self.max_views >= 3),
@@ -206,8 +184,11 @@ class Target:
         function: object = getattr(self, feature)
         return function is not None
 
-    def checked(self) -> "Target":
-        """The same, whose functions raise ``TypeError`` unless they return tensors, as they must.
+    def checked(self, remarks: list[str] | None = None) -> "Target":
+        """The same, whose functions raise unless answers are what :func:`answers.checked` asks.
+
+        Args:
+            remarks: what a failing comparison may come from is added here.
 
         Example:
             >>> import torch
@@ -217,9 +198,10 @@ class Target:
             ...
             TypeError: mine: heatmap_argmax must return a torch.Tensor, pixel (2), got list
         """
+        heard = [] if remarks is None else remarks
         functions: dict[str, Any] = {
-            field: _checked(f"{self.name}: {field}", getattr(self, field), wanted)
-            for field, wanted in _RETURNS.items()
+            field: checked(self.name, field, getattr(self, field), heard)
+            for field in SIGNATURES
             if getattr(self, field) is not None
         }
         return replace(self, **functions)
@@ -228,32 +210,3 @@ class Target:
 def fields_of(feature: str) -> str:
     """What a target has to be given for a feature of :meth:`Target.offers`, in words."""
     return _MADE_OF.get(feature, feature)
-
-
-def _checked(
-    where: str, function: Callable[..., object], wanted: tuple[str, ...]
-) -> Callable[..., object]:
-    def call(*arguments: object) -> object:
-        found = function(*arguments)
-        several = len(wanted) > 1 and isinstance(found, tuple | list)
-        parts = list(found) if several else [found]  # type: ignore[call-overload]
-        if len(parts) != len(wanted) or not all(isinstance(part, Tensor) for part in parts):
-            kinds = ", ".join(type(part).__name__ for part in parts)
-            got = f"({kinds})" if several else kinds
-            what = "a torch.Tensor" if len(wanted) == 1 else f"{len(wanted)} torch.Tensors"
-            raise TypeError(f"{where} must return {what}, {', '.join(wanted)}, got {got}")
-        given = [part for part in arguments if isinstance(part, Tensor)]
-        exact = [_as_given(part, given) for part in parts]
-        return tuple(exact) if len(wanted) > 1 else exact[0]
-
-    return call
-
-
-def _as_given(found: Any, given: list[Tensor]) -> Tensor:
-    """In the widest floating point dtype of the arguments, if of a narrower one itself."""
-    assert isinstance(found, Tensor)
-    dtype = found.dtype
-    for tensor in given:
-        if found.is_floating_point() and tensor.is_floating_point():
-            dtype = torch.promote_types(dtype, tensor.dtype)
-    return found.to(dtype)

@@ -234,7 +234,8 @@ def test_a_field_is_a_function_and_returns_tensors(name: str) -> None:
     def in_numpy(*arguments: Any) -> Any:
         found = function(*arguments)
         several = isinstance(found, tuple)
-        return tuple(part.numpy() for part in found) if several else found.numpy()
+        parts = tuple(part.detach().numpy() for part in (found if several else (found,)))
+        return parts if several else parts[0]
 
     def too_many(*arguments: Any) -> Any:
         found = function(*arguments)
@@ -439,8 +440,8 @@ def test_without_opencv_the_error_names_the_extra(
 
 
 def test_the_page_runs_and_lists_what_fails(capsys: pytest.CaptureFixture[str]) -> None:
-    example, again = _blocks("python")
-    namespace = {"__name__": "page"}
+    example, again, listing = _blocks("python")
+    namespace: dict[str, Any] = {"__name__": "page"}
     exec(compile(example, "docs/testing.md", "exec"), namespace)
     printed = capsys.readouterr().out
     failed = {*re.findall(r"^(\S.*?) +FAIL", printed, re.MULTILINE)}
@@ -452,6 +453,13 @@ def test_the_page_runs_and_lists_what_fails(capsys: pytest.CaptureFixture[str]) 
     assert short in re.sub(r"(\d\.\d{4})\d+", r"\1", printed) + "\n"
     with pytest.raises(AssertionError, match=r"off by 0\.00046, allowed 1e-06 m"):
         exec(compile(again, "docs/testing.md", "exec"), namespace)
+    exec(compile(listing, "docs/testing.md", "exec"), namespace)
+    printed = capsys.readouterr().out
+    assert all(
+        f"{name} " in printed and each.theorem in printed for name, each in INVARIANTS.items()
+    )
+    with pytest.raises(AssertionError, match="instead of"):
+        namespace["test_mine_on_fixed_scenes"]("points_move_with_the_world")
 
 
 def test_the_page_on_geometry_runs_and_names_what_there_is() -> None:

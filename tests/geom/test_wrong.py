@@ -28,6 +28,7 @@ FOUND = {
     "pixels_are_those_of_the_camera_equations": "projected at 0.5 | whole mm",
     "pixels_do_not_know_the_worlds_frame": "whole mm",
     "pixels_follow_a_crop_and_a_resize": "projected at 0.5",
+    "gradients_of_pixels_are_finite_differences": "half the gradient | whole mm",
     "pixels_are_finite": "unguarded",
     "a_pixel_with_its_depth_is_its_point": "world_from_cam | along the ray | unprojected at 0.5",
     "unprojected_points_move_with_the_world": "world_from_cam",
@@ -80,11 +81,13 @@ FOUND = {
     "the_soft_argmax_moves_with_the_positions": "argmax + 1e-3",
     "what_is_masked_does_not_count": "no mask",
     "the_soft_argmax_is_finite": "exp",
+    "gradients_of_the_soft_argmax_are_finite_differences": "logits detached",
     "the_covariance_of_a_delta_is_0": "uncentred | spread of the pixel",
     "the_covariance_of_two_places_is_their_distance": (
         "uncentred | half the spread | spread of the pixel"
     ),
     "the_covariance_does_not_know_where_it_is": "uncentred | spread of the pixel",
+    "what_is_masked_has_no_spread": "spread of all | uncentred",
     "the_soft_argmax_of_a_heatmap_peak_is_its_pixel": (
         "heatmap y, x | heatmap from the corner | heatmap normalised"
     ),
@@ -101,6 +104,10 @@ FOUND = {
     "only_the_ratios_of_weights_count": "weights plus 0.1",
     "a_view_of_weight_0_is_a_view_removed": "weights ignored | weights plus 0.1",
     "a_doubled_view_is_a_doubled_squared_weight": "weights ignored | weights plus 0.1",
+    "twice_the_weight_is_a_quarter_of_the_error": (
+        "weights ignored | weights ignored, pair | weights not squared | weights plus 0.1 | "
+        "1 mm off | pixels stretched"
+    ),
     "a_batch_of_scenes_is_solved_as_each_alone": "first of batch",
     "float32_is_as_good_as_rounding_the_input": "float16",
     "gradients_are_finite_differences": "no gradient",
@@ -126,6 +133,7 @@ FOUND = {
     "a_wrong_view_does_not_move_a_robust_point": (
         "all views | no second look | none right | robust, 1 mm off"
     ),
+    "a_view_of_weight_0_does_not_move_a_robust_point": "robust, no weights | robust, 1 mm off",
     "inliers_are_within_the_threshold": "all views",
     "robust_points_move_with_the_world": "robust, 1 mm off",
     "the_nearest_point_wins": (

@@ -70,6 +70,7 @@ WRONG = [
     Target("at the origin", fundamental=fundamental_of_a_first_view_at_the_origin),
     after("unit F", "fundamental", lambda fundamental: fundamental / fundamental.norm()),
     after("no lines", "fundamental", lambda fundamental: 0 * fundamental),
+    after("half the gradient", "project", lambda pixels: (pixels + pixels.detach()) / 2),
     after("in slopes", "residual", lambda residual: residual / 500),
     Target("mean", residual=of_the_mean),
     Target("algebraic", residual=algebraic),

@@ -1,15 +1,17 @@
 """Wrong triangulations: their points, gradients, statuses, inliers and minima."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
-from wrong import Function, after, ours
+from wrong import Function, after, before, ours
 
 from deltas_geom import triangulate_points
 from deltas_geom.testing.target import Target
 
 
-def points(name: str, solve: Function, **more: bool) -> Target:
+def points(name: str, solve: Function, **more: Any) -> Target:
     """Of which no gradients are asked."""
     return Target(name, differentiable=False, triangulate=solve, **more)
 
@@ -78,6 +80,8 @@ def strict(proj: Tensor, pixels: Tensor, w: Tensor | None, limit: float) -> Robu
 WRONG = [
     points("1 mm off", lambda p, x, w: triangulate_points(p, x, w) + 1e-3),
     points("weights ignored", lambda p, x, w: triangulate_points(p, x)),
+    points("weights ignored, pair", lambda p, x, w: triangulate_points(p, x), max_views=2),
+    points("weights not squared", lambda p, x, w: triangulate_points(p, x, w.sqrt()), max_views=2),
     points("weights plus 0.1", lambda p, x, w: triangulate_points(p, x, w + 0.1)),
     points("pixels stretched", lambda p, x, w: triangulate_points(p, 1.001 * x, w)),
     points("first view twice", first_view_counts_twice),
@@ -96,6 +100,7 @@ WRONG = [
     Target("random walk", refine=lambda proj, x, points, w: points + 1e-4),
     Target("all views", robust=all_views),
     Target("no second look", robust=strict),
+    before("robust, no weights", "robust", lambda p, x, w, limit: (p, x, None, limit)),
     after("none right", "robust", lambda points, inliers: (points, inliers & False)),
     after("robust, 1 mm off", "robust", lambda points, inliers: (points + 1e-3, inliers)),
 ]

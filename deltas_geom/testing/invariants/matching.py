@@ -4,7 +4,12 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import pixel_grid
-from deltas_geom.testing.agreement import VALUE_TOLERANCE, assert_finite, assert_near
+from deltas_geom.testing.agreement import (
+    VALUE_TOLERANCE,
+    assert_finite,
+    assert_gradients,
+    assert_near,
+)
 from deltas_geom.testing.planar import ScoreScene
 from deltas_geom.testing.registry import invariant
 from deltas_geom.testing.target import Target
@@ -67,6 +72,17 @@ def the_soft_argmax_is_finite(target: Target, scene: ScoreScene) -> None:
     assert_finite(_position(target, nothing), "position where all is masked,")
 
 
+@invariant("soft_argmax", "autograd", scenes="scores")
+def gradients_of_the_soft_argmax_are_finite_differences(target: Target, scene: ScoreScene) -> None:
+    """The gradient by logits and positions is finite and that of finite differences."""
+
+    def mean(logits: Tensor, positions: Tensor) -> Tensor:
+        return _position(target, scene._replace(logits=logits, positions=positions))
+
+    inputs = [scene.logits, scene.positions]
+    assert_gradients(mean, inputs, ("logits", "positions"), "(position)")
+
+
 @invariant("soft_covariance", scenes="scores")
 def the_covariance_of_a_delta_is_0(target: Target, scene: ScoreScene, *, place: int = 1) -> None:
     """All probability in one place leaves no spread."""
@@ -93,6 +109,21 @@ def the_covariance_does_not_know_where_it_is(
     moved = scene._replace(positions=2 * scene.positions + shift)
     found = _covariance(target, moved) / 4
     assert_near(found, wanted, VALUE_TOLERANCE * 1000, "(position squared)")
+
+
+@invariant("soft_covariance", scenes="scores")
+def what_is_masked_has_no_spread(target: Target, scene: ScoreScene) -> None:
+    """A masked place counts as one that is not there, whatever its logit and position, also NaN."""
+    mask = scene.mask.flatten().clone()
+    mask[0], mask[-1] = False, True
+    logits, positions = scene.logits.flatten(), scene.positions
+    assert target.soft_covariance is not None
+    wanted = target.soft_covariance(logits[mask], positions[mask], mask[mask])
+    for junk in (1e9, torch.nan):
+        found = target.soft_covariance(
+            torch.where(mask, logits, junk), torch.where(mask[:, None], positions, junk), mask
+        )
+        assert_near(found, wanted, VALUE_TOLERANCE * 1000, "(position squared)")
 
 
 @invariant("heatmap_argmax", scenes="scores")

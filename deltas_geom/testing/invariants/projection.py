@@ -6,7 +6,13 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import to_homogeneous
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.testing.agreement import EXTREMES, PIXEL_TOLERANCE, assert_finite, assert_near
+from deltas_geom.testing.agreement import (
+    EXTREMES,
+    PIXEL_TOLERANCE,
+    assert_finite,
+    assert_gradients,
+    assert_near,
+)
 from deltas_geom.testing.changes import ELSEWHERE, World, cut, transformed
 from deltas_geom.testing.registry import invariant
 from deltas_geom.testing.scenes import PosedScene
@@ -45,6 +51,18 @@ def pixels_follow_a_crop_and_a_resize(
     seen = _pixels(target, scene.views._replace(K=change @ scene.views.K), scene.points)
     wanted = transformed(change, _pixels(target, scene.views, scene.points))
     assert_near(seen, wanted, tolerance, "px")
+
+
+@invariant("project", "autograd")
+def gradients_of_pixels_are_finite_differences(target: Target, scene: PosedScene) -> None:
+    """The gradient by points, K and poses is finite and that of finite differences."""
+    views = scene.views
+
+    def see(points: Tensor, K: Tensor, pose: Tensor) -> Tensor:
+        return _pixels(target, views._replace(K=K, cam_from_world=pose), points)
+
+    inputs = [scene.points, views.K, views.cam_from_world]
+    assert_gradients(see, inputs, ("points", "K", "cam_from_world"), "px")
 
 
 @invariant("project", scenes="named")

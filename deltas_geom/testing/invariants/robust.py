@@ -36,6 +36,20 @@ def a_wrong_view_does_not_move_a_robust_point(
     _assert_found(target, scene._replace(pixels=pixels), right)
 
 
+@invariant("robust", "weights", "many views")
+def a_view_of_weight_0_does_not_move_a_robust_point(
+    target: Target, scene: PosedScene, *, view: int = -1, spoil: float = 2.0
+) -> None:
+    """A view of weight 0 moves nothing, also where it is off by less than the threshold."""
+    pixels = project(scene.views, scene.points).pixels
+    pixels[view, :, 1] += spoil
+    weights = weights_for(target, scene, None)
+    assert weights is not None and target.robust is not None
+    weights[view] = 0
+    points, _ = target.robust(scene.views.proj, pixels, weights, _THRESHOLD)
+    assert_near(points, scene.points, POINT_TOLERANCE, "m")
+
+
 @invariant("robust")
 def inliers_are_within_the_threshold(
     target: Target, scene: PosedScene, *, spoil: float = 9.0
