@@ -19,7 +19,6 @@ BY_DAY = (
     "triangulate",
     "triangulate_points, weights",
     "triangulate_rays",
-    "undistort_image",
 )
 EACH = pytest.mark.parametrize(
     "name", [name if name in BY_DAY else pytest.param(name, marks=pytest.mark.slow) for name in ALL]

@@ -30,14 +30,13 @@ from deltas_nets.weights_file import load_model
 
 
 class Exported(NamedTuple):
-    """A network of so many views, and what it became."""
+    """A network of so many views, and the file that it became."""
 
     model: Deltas
     config: ExportConfig
-    onnx: bytes
-    onnx_run: RunExported
-    program: bytes
-    program_run: RunExported
+    form: str
+    content: bytes
+    run: RunExported
 
     def eager(self, inputs: Inputs) -> dict[str, Tensor]:
         with torch.no_grad():
@@ -45,34 +44,40 @@ class Exported(NamedTuple):
         return found
 
 
+# ONNX takes a minute to be made.
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(3, id="3 views"),
-        pytest.param(2, id="2 views", marks=pytest.mark.slow),
+        pytest.param(("program", 3), id="program, 3 views"),
+        pytest.param(("program", 2), id="program, 2 views", marks=pytest.mark.slow),
+        pytest.param(("onnx", 3), id="ONNX, 3 views", marks=pytest.mark.slow),
+        pytest.param(("onnx", 2), id="ONNX, 2 views", marks=pytest.mark.slow),
     ],
 )
 def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     needs_extra()
-    model, config = load_model(), ExportConfig(request.param, 64, SIZE)
-    onnx, program = files_of(model, config, tmp_path_factory.getbasetemp())
-    return Exported(model, config, onnx, onnx_runner(onnx), program, program_runner(program, CPU))
+    form, num_views = request.param
+    model, config = load_model(), ExportConfig(num_views, 64, SIZE)
+    content = content_of(form, model, config, tmp_path_factory.getbasetemp())
+    run = onnx_runner(content) if form == "onnx" else program_runner(content, CPU)
+    return Exported(model, config, form, content, run)
 
 
-def files_of(model: Deltas, config: ExportConfig, folder: Path) -> tuple[bytes, bytes]:
-    """The network as ONNX and as a program, made once for all processes of a run.
-
-    It takes most of a minute.
-    """
+def content_of(form: str, model: Deltas, config: ExportConfig, folder: Path) -> bytes:
+    """The network's file, made once for all processes of a run."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
-    files = folder / f"{config.num_views}.onnx", folder / f"{config.num_views}.pt2"
-    with FileLock(folder / f"export {config.num_views}.lock"):
-        if not files[1].exists():
+    file = folder / f"{config.num_views}.{form}"
+    with FileLock(f"{file}.lock"):
+        if not file.exists():
             graph, metadata = trace(model, config), metadata_of(model, config, {"step": "7"})
-            files[0].write_bytes(onnx_bytes(graph, metadata, Path("x.onnx")))
-            files[1].write_bytes(program_bytes(graph, metadata))
-    return files[0].read_bytes(), files[1].read_bytes()
+            made = (
+                onnx_bytes(graph, metadata, Path("x.onnx"))
+                if form == "onnx"
+                else program_bytes(graph, metadata)
+            )
+            file.write_bytes(made)
+    return file.read_bytes()
 
 
 def test_shapes_are_as_documented(exported: Exported) -> None:
@@ -82,9 +87,8 @@ def test_shapes_are_as_documented(exported: Exported) -> None:
         "keypoints": (1, 64, 2),
         "points": (1, 64, 3),
     }
-    for run in (exported.onnx_run, exported.program_run):
-        found = run(room(1, exported.config))
-        assert {name: tuple(tensor.shape) for name, tensor in found.items()} == shapes
+    found = exported.run(room(1, exported.config))
+    assert {name: tuple(tensor.shape) for name, tensor in found.items()} == shapes
 
 
 def test_other_rooms_and_cameras_give_the_networks_depth(exported: Exported) -> None:
@@ -92,11 +96,10 @@ def test_other_rooms_and_cameras_give_the_networks_depth(exported: Exported) -> 
     for seed in range(20, 26):
         inputs = room(seed, exported.config)
         wanted = exported.eager(inputs)
-        found = exported.onnx_run(inputs)
+        found = exported.run(inputs)
         if not same_points(found["keypoints"], wanted["keypoints"]):
             continue  # a tie of two detections, which rounding decides
         assert_same_depth(found, wanted)
-        assert_same_depth(exported.program_run(inputs), wanted)
         depths.append(wanted["depth"])
     assert len(depths) >= 3
     # No two rooms look alike to it: nothing of one was kept for another.
@@ -152,28 +155,22 @@ def test_hard_cameras_give_the_networks_depth(
     compared = 0
     for seed in range(20, 23):
         inputs = change(room(seed, exported.config))
-        wanted, found = exported.eager(inputs), exported.onnx_run(inputs)
+        wanted, found = exported.eager(inputs), exported.run(inputs)
         assert wanted["depth"].isfinite().all()
         if same_points(found["keypoints"], wanted["keypoints"]):
             assert_same_depth(found, wanted)
-            assert_same_depth(exported.program_run(inputs), wanted)
             compared += 1
     assert compared > 0
 
 
 def test_points_that_are_not_found_are_zero_in_the_file_too(exported: Exported) -> None:
     inputs = no_baseline(room(20, exported.config))
-    for run in (exported.onnx_run, exported.program_run):
-        assert (run(inputs)["points"] == 0).all()
-    seen = exported.onnx_run(room(20, exported.config))
+    assert (exported.run(inputs)["points"] == 0).all()
+    seen = exported.run(room(20, exported.config))
     assert (seen["points"] != 0).any(-1).float().mean() > 0.5
 
 
-def test_an_onnx_file_needs_onnxruntime_alone_and_tells_what_it_is(
-    exported: Exported, tmp_path: Path
-) -> None:
-    (tmp_path / "x.onnx").write_bytes(exported.onnx)
-    code = """
+ONNX = """
 import json, sys
 for name in ("torch", "deltas_nets", "deltas_geom", "onnx"):
     sys.modules[name] = None
@@ -187,15 +184,7 @@ depth = session.run(["depth"], fed)[0]
 assert numpy.isfinite(depth).all() and (depth > 0).all()
 print(json.dumps(session.get_modelmeta().custom_metadata_map))
 """
-    metadata = json.loads(python(code, tmp_path))
-    assert_tells_what_it_is(metadata, exported)
-
-
-def test_a_program_needs_torch_alone_and_tells_what_it_is(
-    exported: Exported, tmp_path: Path
-) -> None:
-    (tmp_path / "x.pt2").write_bytes(exported.program)
-    code = """
+PROGRAM = """
 import sys
 for name in ("deltas_nets", "deltas_geom"):
     sys.modules[name] = None
@@ -210,6 +199,13 @@ depth = run(torch.zeros(1, views, 3, 64, 96), K, poses)["depth"]
 assert depth.isfinite().all() and (depth > 0).all()
 print(extra["deltas.json"])
 """
+
+
+def test_a_file_needs_its_runtime_alone_and_tells_what_it_is(
+    exported: Exported, tmp_path: Path
+) -> None:
+    name, code = {"onnx": ("x.onnx", ONNX), "program": ("x.pt2", PROGRAM)}[exported.form]
+    (tmp_path / name).write_bytes(exported.content)
     metadata = json.loads(python(code, tmp_path, str(exported.config.num_views)))
     assert_tells_what_it_is(metadata, exported)
 
@@ -243,7 +239,5 @@ def test_the_fingerprint_is_of_every_weight() -> None:
 
 def test_a_file_does_not_tell_where_it_was_made(exported: Exported) -> None:
     home = str(Path(formats.__file__).parents[2]).encode()
-    for content in (exported.onnx, exported.program):
-        assert home not in content
-        assert b"deltas_nets/network" not in content
-        assert sys.prefix.encode() not in content
+    for told in (home, b"deltas_nets/network", sys.prefix.encode()):
+        assert told not in exported.content
