@@ -73,9 +73,7 @@ def diagnose(
         True
     """
     seen = _checked(views, pixels, mask, threshold)
-    # All that is compared is there, and so must be what is made on the way.
-    with torch.device("cpu"):
-        return _diagnosed(views, pixels, seen, threshold)
+    return _diagnosed(views, pixels, seen, threshold)
 
 
 def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float) -> Diagnosis:

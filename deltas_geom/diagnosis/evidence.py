@@ -33,7 +33,7 @@ class Evidence(NamedTuple):
 
     def with_camera(self, *cameras: int) -> Tensor:
         """Which pairs have one of the cameras, ``(P)`` bool."""
-        return torch.isin(self.pairs, torch.tensor(cameras)).any(dim=-1)
+        return torch.isin(self.pairs, self.pairs.new_tensor(cameras)).any(dim=-1)
 
 
 def gather_evidence(pixels: Tensor, seen: Tensor) -> Evidence:
@@ -51,10 +51,10 @@ def gather_evidence(pixels: Tensor, seen: Tensor) -> Evidence:
     total = both.sum(dim=-1, keepdim=True)
     step = (total / _MOST).clamp(min=1.0)
     slot = torch.where(both, (rank / step).long(), _MOST).clamp(max=_MOST)
-    points = torch.arange(seen.shape[1]).expand_as(slot)
-    index = torch.zeros(len(pairs), _MOST + 1, dtype=torch.long).scatter(1, slot, points)
+    points = torch.arange(seen.shape[1], device=seen.device).expand_as(slot)
+    index = points.new_zeros(len(pairs), _MOST + 1).scatter(1, slot, points)
     index = index[:, : int(counts.max()) if len(pairs) else 0]
-    filled = torch.arange(index.shape[1]) < counts[:, None]
+    filled = torch.arange(index.shape[1], device=seen.device) < counts[:, None]
     first, second = (
         torch.where(filled[..., None], pixels[view[:, None], index], torch.nan)
         for view in pairs.unbind(dim=-1)
@@ -66,9 +66,10 @@ def choose_pairs(seen: Tensor) -> Tensor:
     """``(P, 2)`` pairs with matches enough: all of few views, the richest of many."""
     views = seen.shape[0]
     common = seen.double() @ seen.double().mT
-    offset = (torch.arange(views)[:, None] - torch.arange(views)).abs()
+    place = torch.arange(views, device=seen.device)
+    offset = (place[:, None] - place).abs()
     # Of equally many matches, neighbours and some far ones: 1, 2, 3, 5, 8, ... views apart.
-    steps = torch.tensor([1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
+    steps = place.new_tensor([1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
     nearness = 0.5 / (1 + offset) + 0.5 * torch.isin(offset, steps)
     score = torch.where((common >= LEAST_MATCHES) & (offset > 0), common + 0.9 * nearness, -1.0)
     if views > _PARTNERS + 1:

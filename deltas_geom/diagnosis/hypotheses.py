@@ -14,8 +14,8 @@ from deltas_geom.diagnosis.evidence import Evidence, inverse_up_to_scale, residu
 
 COMMON_SIZES = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5)
 COMMON_UNITS = (1000.0, 0.001, 100.0, 0.01, 10.0, 0.1, 0.3048, 1 / 0.3048, 0.0254, 1 / 0.0254)
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
-_SWAP = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]).double()
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], device="cpu").double())
+_SWAP = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]], device="cpu").double()
 _SIZES = sorted({*COMMON_SIZES, *(2 ** (step / 8) for step in range(-16, 17) if step)})
 _FINEST = 1e-4  # relative, of factors that are searched
 
@@ -63,8 +63,8 @@ MENDS: dict[Cause, Mend] = {
 
 def resized(K: Tensor, factor: float) -> Tensor:
     """K of images ``factor`` times as large."""
-    half = torch.tensor([[factor, 0, factor / 2 - 0.5], [0, factor, factor / 2 - 0.5], [0, 0, 1]])
-    return half.to(K) @ K
+    half = K.new_tensor([[factor, 0, factor / 2 - 0.5], [0, factor, factor / 2 - 0.5], [0, 0, 1]])
+    return half @ K
 
 
 def zoomed(K: Tensor, factor: float) -> Tensor:
@@ -112,7 +112,7 @@ def _of(
 
 def exchanged(K: Tensor, pose: Tensor, one: int, other: int) -> Hypothesis:
     """Pixels of two views exchanged, which is as well two cameras exchanged."""
-    order = torch.arange(len(K))
+    order = torch.arange(len(K), device=K.device)
     order[[one, other]] = order[[other, one]]
     return Hypothesis(Cause.VIEWS_SWAPPED, (one, other), None, K[order], pose[order])
 

@@ -12,9 +12,7 @@ from deltas_geom import invert_pose
 from deltas_geom.diagnosis.causes import Cause
 
 
-@pytest.fixture(
-    scope="module", params=["hololens", pytest.param("sevenscenes_reg", marks=pytest.mark.slow)]
-)
+@pytest.fixture(scope="module", params=["hololens", "sevenscenes_reg"])
 def real(request: pytest.FixtureRequest, shared_data: Path) -> list[Capture]:
     """View sets matched by SIFT, with the mismatches that it has."""
     cv2 = pytest.importorskip("cv2")
