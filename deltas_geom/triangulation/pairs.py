@@ -24,7 +24,7 @@ def pairs_of(usable: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def points_of_pairs(
-    centers: Tensor, directions: Tensor, first: Tensor, second: Tensor, exist: Tensor
+    lines: Tensor, first: Tensor, second: Tensor, exist: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Points ``(*B, 3, C, N)`` of pairs of views, and whether they exist ``(*B, C, N)``.
 
@@ -32,27 +32,28 @@ def points_of_pairs(
     by about as many pixels.
 
     Args:
-        centers: ``(*B, V, 3)`` of the cameras.
-        directions: ``(*B, 3, V, N)`` of rays of depth 1; 0 if there is no centre.
+        lines: ``(*B, 6, V, N)`` centres of the cameras, then directions of rays of depth 1; 0 if
+            there is no centre.
         first: ``(*B, C, N)`` index of a view.
         second: likewise.
         exist: ``(*B, C, N)`` bool.
     """
-    centers = centers.mT.unsqueeze(-1).expand_as(directions)
-
-    def of(values: Tensor, view: Tensor) -> Tensor:
-        return torch.take_along_dim(values, view.unsqueeze(-3), dim=-2)
+    views = torch.cat([first, second], dim=-2).unsqueeze(-3)
+    # Not take_along_dim: for the sake of negative ones it divides each index.
+    of_both = lines.gather(-2, views.expand(*lines.shape[:-2], -1, -1))
+    (start, one), (end, other) = (
+        half.tensor_split(2, dim=-3) for half in of_both.tensor_split(2, dim=-2)
+    )
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
         return (a * b).sum(dim=-3)
 
-    one, other = of(directions, first), of(directions, second)
-    start, end = of(centers, first), of(centers, second)
     apart = end - start
     a, b, c = dot(one, one), dot(one, other), dot(other, other)
     p, q = dot(apart, one), dot(apart, other)
-    crossing = a * c > b * b
-    sine = torch.where(crossing, a * c - b * b, 1.0)
+    sine = a * c - b * b
+    crossing = sine > 0
+    sine = torch.where(crossing, sine, 1.0)
     near, far = (c * p - b * q) / sine, (b * p - a * q) / sine
     # An offset at depth z moves the pixel by 1 / z: the nearer view has more to say.
     share = near.square() / (near.square() + far.square())

@@ -192,36 +192,38 @@ def _consensus(
     known: KnownCameras, threshold: float, min_inliers: int, max_pairs: int, *tensors: Any
 ) -> tuple[Tensor, Tensor]:
     """Inliers ``(*B, V, N)``, and where there are none the status that says why ``(*B, N)``."""
-    observed = _Observations(*tensors)
-    seen = observed.pixels, observed.weights
+    observed, limit = _Observations(*tensors), threshold**2
 
-    def solved(used: Tensor) -> tuple[Tensor, Tensor]:
-        points, status = Call(known, *seen, used, "rig").solved()
-        return points.mT.unsqueeze(-2), status
+    def solved(used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The point of these views as a candidate ``(*B, 3, 1, N)``, is it valid, its status."""
+        points, status = Call(known, observed.pixels, observed.weights, used, "rig").solved()
+        return points.mT.unsqueeze(-2), ok(status).unsqueeze(-2), status
 
-    def judged(points: Tensor, exist: Tensor) -> _Best:
-        return _judge(observed, points, exist, threshold, min_inliers)
-
-    points, status = solved(observed.usable)
-    used, again = observed.usable, status
-    best = judged(points, ok(status).unsqueeze(-2))
-    pairs = pairs_of(observed.usable, max_pairs)
-    at_once = max(1, _BUDGET // max(1, observed.usable.numel()))
-    for start in range(0, pairs[0].shape[-2], at_once):
+    used = observed.usable
+    *whole, status = solved(used)
+    centers = observed.centers.mT.unsqueeze(-1).expand_as(observed.directions)
+    lines = torch.cat([centers, observed.directions], dim=-3)
+    pairs = pairs_of(used, max_pairs)
+    at_once = max(1, _BUDGET // max(1, used.numel()))
+    for start in range(0, max(1, pairs[0].shape[-2]), at_once):
         some = (tensor[..., start : start + at_once, :] for tensor in pairs)
-        best = best.or_cheaper(
-            judged(*points_of_pairs(observed.centers, observed.directions, *some))
-        )
-    agree = best.inliers
+        found = points_of_pairs(lines, *some)
+        if start == 0:
+            points, exist = (torch.cat(both, -2) for both in zip(whole, found, strict=True))
+            distance = _distances(observed, points, exist)
+            best = _best_of(observed, distance, limit, min_inliers)
+            agree = distance[..., 0, :] < limit
+        else:
+            distance = _distances(observed, *found)
+            best = best.or_cheaper(_best_of(observed, distance, limit, min_inliers))
     for _ in range(_ROUNDS):
         # The better point finds inliers that a pair's noise had hidden, or loses some.
-        same = surely_all(best.inliers == used)
-        points, again = (points, again) if same else solved(best.inliers)
-        agree = _distances(observed, points)[0].squeeze(-2) < threshold**2
-        before, used = best, best.inliers
-        best = best.or_cheaper(judged(points, ok(again).unsqueeze(-2)))
-        if surely_all(best.inliers == before.inliers):
+        if surely_all(best.inliers == used):
             break
+        used = best.inliers
+        distance = _distances(observed, *solved(used)[:2])
+        best = best.or_cheaper(_best_of(observed, distance, limit, min_inliers))
+        agree = distance.squeeze(-2) < limit
     # An inlier is within the threshold of the point that the inliers have, or there are none.
     true = (agree | ~best.inliers).all(dim=-2, keepdim=True)
     reason = torch.where(ok(status), int(Status.TOO_FEW_VIEWS), status)
@@ -229,35 +231,30 @@ def _consensus(
     return best.inliers & true, torch.where(explained, reason, int(Status.NOT_FINITE_INPUT))
 
 
-def _distances(observed: _Observations, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared distances ``(*B, V, C, N)`` px^2 of candidates ``(*B, 3, C, N)``; do these exist?
+def _distances(observed: _Observations, points: Tensor, exist: Tensor) -> Tensor:
+    """Squared distances ``(*B, V, C, N)`` px^2 of candidates ``(*B, 3, C, N)``.
 
-    Infinite behind a view, and of what is too far to exist.
+    Infinite behind a view, of what does not exist ``(*B, C, N)``, and of what is too far to.
     """
-    exist = (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(dim=-3)
-    if not surely_all(exist):
-        points = torch.where(exist.unsqueeze(-3), points, 0.0)
+    exist = exist & (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(dim=-3)
+    existing = unless_all(exist.unsqueeze(-3))
+    points = only(points, existing)
     views, shape = observed.usable.shape[-2], points.shape[-2:]
     rows = observed.proj.flatten(-3, -2)  # (*B, 3 V, 4): one product for all
     seen = product(rows[..., :3], points.flatten(-2)) + rows[..., 3:]
     x, y, z = seen.reshape(*seen.shape[:-2], views, 3, *shape).unbind(dim=-3)
-    in_front = z > torch.finfo(z.dtype).tiny ** 0.25
-    everywhere = surely_all(in_front)
-    inverse = z.reciprocal() if everywhere else 1 / torch.where(in_front, z, 1.0)
+    in_front = unless_all(z > torch.finfo(z.dtype).tiny ** 0.25)
+    inverse = only(z, in_front, other=1.0).reciprocal()
     u, v = observed.pixels.unsqueeze(-3).unbind(dim=-1)
     distance = (x * inverse - u).square() + (y * inverse - v).square()
-    return distance if everywhere else torch.where(in_front, distance, torch.inf), exist
+    return only(distance, in_front, existing, other=torch.inf)
 
 
-def _judge(
-    observed: _Observations, points: Tensor, exist: Tensor, threshold: float, min_inliers: int
-) -> _Best:
-    """The best of the candidates ``(*B, 3, C, N)`` of each point, if any exist ``(*B, C, N)``."""
-    distance, representable = _distances(observed, points)
-    distance = distance.clamp(max=threshold**2)
-    agree = observed.usable.unsqueeze(-2) & (distance < threshold**2)
-    cost = (observed.squared.unsqueeze(-2) * distance).sum(dim=-3)
-    possible = exist & representable & (agree.sum(dim=-3) >= min_inliers)
-    cheapest, index = torch.where(possible, cost, torch.inf).min(dim=-2, keepdim=True)
-    inliers = torch.take_along_dim(agree, index.unsqueeze(-3), dim=-2).squeeze(-2)
+def _best_of(observed: _Observations, distance: Tensor, limit: float, min_inliers: int) -> _Best:
+    """The best of the candidates of each point, of which these are the distances."""
+    agree = observed.usable.unsqueeze(-2) & (distance < limit)
+    cost = (observed.squared.unsqueeze(-2) * distance.clamp(max=limit)).sum(dim=-3)
+    cost = torch.where(agree.sum(dim=-3) >= min_inliers, cost, torch.inf)
+    cheapest, index = cost.min(dim=-2, keepdim=True)
+    inliers = agree.gather(-2, index.unsqueeze(-3).expand_as(agree[..., :1, :])).squeeze(-2)
     return _Best(inliers & cheapest.isfinite(), cheapest.squeeze(-2))
