@@ -19,12 +19,18 @@ SERIAL = 32767
 _SERIAL_PRODUCT = 2**18  # multiplications
 
 
-def over_views(coefficients: Tensor, values: Tensor) -> tuple[Tensor, ...]:
-    """For K coefficients ``(*B, K, V)`` of views, K sums ``(*B, N)`` of values ``(*B, V, N)``."""
+def over_views(coefficients: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """For K coefficients ``(*B, K, V)`` of views, K sums ``(*B, N)`` of values ``(*B, V, N)``.
+
+    Values may come in parts, some of the V each.
+    """
     if torch.compiler.is_compiling():
-        sums: tuple[Tensor, ...] = _FusedSums.apply(coefficients, values)  # type: ignore[no-untyped-call]
-        return sums
-    return product(coefficients, values).unbind(dim=-2)
+        # Joined they would be carried through memory.
+        own = torch.split(coefficients, [part.shape[-2] for part in values], dim=-1)
+        sums = [_FusedSums.apply(*pair) for pair in zip(own, values, strict=True)]  # type: ignore[no-untyped-call]
+        return tuple(sum(of_parts[1:], of_parts[0]) for of_parts in zip(*sums, strict=True))
+    joined = values[0] if len(values) == 1 else torch.cat(values, dim=-2)
+    return product(coefficients, joined).unbind(dim=-2)
 
 
 def over_points(rows: Tensor, values: Tensor) -> Tensor:

@@ -40,41 +40,43 @@ def rows(proj: Numbers, pixels: Numbers) -> Numbers:
 
 
 def normal_matrix(
-    coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor
+    coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor | None = None
 ) -> tuple[Tensor, ...]:
     """A^T A, the upper triangle row by row.
 
     Args:
-        coefficients: ``(*B, V, 4, D (D + 1) / 2)`` of the cameras, see
-            :func:`normal_coefficients`.
+        coefficients: of the cameras, see :func:`normal_coefficients`.
         x, y: ``(*B, V, N)`` px.
-        squared: ``(*B, V, N)`` squared weights, or ``(*B, V, 1)`` where points are alike.
+        squared: ``(*B, V, N)`` squared weights; None where the coefficients hold them.
 
     Returns:
         D (D + 1) / 2 entries ``(*B, N)``.
     """
-    if squared.shape[-1] != x.shape[-1]:  # weights of the cameras, which are fewer than points
-        of_square, of_x, of_y, of_one = (coefficients * squared.unsqueeze(-1)).unbind(dim=-2)
-        factors = torch.cat([of_square, of_x, of_y, of_one.sum(dim=-2, keepdim=True)], dim=-2)
+    if squared is None:
         one = torch.ones_like(x[..., :1, :])
-        return over_views(factors.mT, torch.cat([torch.addcmul(x * x, y, y), x, y, one], dim=-2))
+        return over_views(coefficients, torch.addcmul(x * x, y, y), x, y, one)
     across, down = x * squared, y * squared
-    square = torch.addcmul(x * across, y, down)
-    terms = torch.cat([square, across, down, squared], dim=-2)
-    return over_views(coefficients.transpose(-3, -2).flatten(-3, -2).mT, terms)
+    return over_views(coefficients, torch.addcmul(x * across, y, down), across, down, squared)
 
 
-def normal_coefficients(proj: Tensor) -> Tensor:
-    """``(*B, V, 4, D (D + 1) / 2)``: every entry of a view's normal matrix is linear in these.
+def normal_coefficients(proj: Tensor, squared: Tensor | None = None) -> Tensor:
+    """``(*B, D (D + 1) / 2, 4 V)``: every entry of a normal matrix is linear in these.
 
-    They belong to x^2 + y^2, x, y and 1, whatever the pixel (x, y), so that all points share them.
+    They belong to x^2 + y^2, x, y and 1 of each view, whatever the pixel (x, y), so that all points
+    share them.
 
     Args:
         proj: ``(*B, V, 3, D)`` rows p1, p2, p3, of D = 4 (homogeneous points) or 3 entries.
+        squared: ``(*B, V, 1)`` squared weights of the views, if points have none of their own;
+            what belongs to 1 is summed then: ``(*B, D (D + 1) / 2, 3 V + 1)``.
     """
     outer = proj[..., :, None, :, None] * proj[..., None, :, None, :]  # (*B, V, 3, 3, D, D)
     (e11, _, e13), (_, e22, e23), (e31, e32, e33) = (
         row.unbind(dim=-3) for row in outer.unbind(dim=-4)
     )
-    squares = torch.stack([e33, -(e31 + e13), -(e32 + e23), e11 + e22], dim=-3)
-    return torch.cat([squares[..., row, row:] for row in range(proj.shape[-1])], dim=-1)
+    squares = torch.stack([e33, -(e31 + e13), -(e32 + e23), e11 + e22], dim=-4)
+    upper = torch.cat([squares[..., row, row:] for row in range(proj.shape[-1])], dim=-1)
+    if squared is None:
+        return upper.flatten(-3, -2).mT  # (*B, 4, V, D (D + 1) / 2) before
+    *moving, of_one = (upper * squared.unsqueeze(-3)).unbind(dim=-3)
+    return torch.cat([*moving, of_one.sum(dim=-2, keepdim=True)], dim=-2).mT

@@ -126,7 +126,8 @@ def alike_of(rig: Rig, frame: Frame, dtype: torch.dtype) -> Alike:
     weights = weigh(None, None, batch=like.shape[:-3], like=like, sound=None)
     framed = _framed(rig, rig_sums(rig.moments, weights), frame, dtype)
     # Few cameras are moved, not every matrix.
-    return Alike(framed, normal_coefficients(cameras_in_frame(rig.near, framed.held())))
+    moved = cameras_in_frame(rig.near, framed.held())
+    return Alike(framed, normal_coefficients(moved, weights.squared))
 
 
 def equations_of(
@@ -152,7 +153,7 @@ def equations_of(
         held, normal = framed.held(), normal_matrix(rig.coefficients, x, y, weights.squared)
         normal = in_frame(normal, held.origin, held.unit)
     else:
-        framed, normal = alike.frame, normal_matrix(alike.coefficients, x, y, weights.squared)
+        framed, normal = alike.frame, normal_matrix(alike.coefficients, x, y)
     framed = framed._replace(finite=framed.finite & weights.sound)
     return Equations(rig, framed, normal, observed, dtype, frame == "world")
 

@@ -53,22 +53,30 @@ def weigh(
     """
     views, work = like.shape[-3], solver_dtype(like)
     alike = weights is None and mask is None
+    if alike and sound is None:
+        return _all_one(like.new_ones((*batch, views, 1), dtype=work))
     weight = like.new_ones((), dtype=work) if weights is None else weights.to(work)
     if mask is not None:
         weight = torch.where(mask, weight, 0.0)
     weight = weight.expand(*batch, views, 1 if alike else like.shape[-2])
     size = weight.detach().abs()
     largest = size.amax(dim=-2, keepdim=True)
-    if sound is None and (alike or _all_count(size, largest)):
-        one = size.new_ones((*batch, views, 1))
-        none = torch.zeros_like(one, dtype=torch.bool)
-        share = one if alike else weight / largest
-        return Weights(share * share, largest, none, one, ~none[..., 0, :])
+    if sound is None and _all_count(size, largest):
+        share = weight / largest
+        return _all_one(size.new_ones((*batch, views, 1)))._replace(
+            squared=share * share, largest=largest
+        )
     # What is not sound makes its point fail, if it is used: it need not be told from point to
     # point where all are alike.
     squared, largest, unused, counted = _shares(weight, largest, None if alike else sound)
     known = counted if sound is None else (sound | unused) & counted
     return Weights(squared, largest, unused, (~unused).to(work), known.all(dim=-2))
+
+
+def _all_one(one: Tensor) -> Weights:
+    """Of views ``(*B, V, 1)`` that all count, and as much."""
+    none = torch.zeros_like(one, dtype=torch.bool)
+    return Weights(one, one[..., :1, :], none, one, ~none[..., 0, :])
 
 
 def weigh_listed(weights: Tensor, point: Tensor, count: int, *, sound: Tensor) -> Weights:

@@ -47,10 +47,14 @@ def begin(folder: Path, beginning: Beginning) -> None:
     """Write what a recipe begins with, or compare it with what an earlier run began with.
 
     Raises:
-        UserError: names what differs; or the folder's record cannot be read.
+        UserError: names what differs; the folder holds something else, or its record cannot be
+            read.
     """
     file, record = folder / RECORD, beginning.record()
     if not file.exists():
+        if folder.exists() and any(folder.iterdir()):
+            what = "the folder holds something else"
+            raise UserError(what, folder, "name a new folder with --out")
         folder.mkdir(parents=True, exist_ok=True)
         write_json(file, record)
         return

@@ -55,7 +55,7 @@ def test_it_is_the_square_of_the_rows(columns: int, drawn: tuple[Tensor, ...]) -
     equations = rows_of(proj[..., :columns], x, y, squared)
     wanted = equations.mT @ equations
     found = normal_matrix(normal_coefficients(proj[..., :columns]), x, y, squared)
-    alike = normal_matrix(normal_coefficients(proj[..., :columns]), x, y, squared[:, :1])
+    alike = normal_matrix(normal_coefficients(proj[..., :columns], squared[:, :1]), x, y)
     upper = torch.triu_indices(columns, columns)
     assert len(found) == columns * (columns + 1) // 2
     assert_close(torch.stack(found, dim=-1), wanted[:, upper[0], upper[1]], rtol=0, atol=1e-12)
@@ -195,7 +195,10 @@ def test_it_is_the_product_of_the_rows(columns: int, count: int) -> None:
     proj = torch.randn(2, 3, 3, columns, generator=random, dtype=torch.float64)
     x, y = torch.randn(2, 2, 3, 7, generator=random, dtype=torch.float64)
     squared = torch.rand(2, 3, count, generator=random, dtype=torch.float64)
-    found = torch.stack(normal_matrix(normal_coefficients(proj), x, y, squared), dim=-1)
+    if count == 1:
+        found = torch.stack(normal_matrix(normal_coefficients(proj, squared), x, y), dim=-1)
+    else:
+        found = torch.stack(normal_matrix(normal_coefficients(proj), x, y, squared), dim=-1)
     pixels, weights = torch.stack([x, y], dim=-1), squared.sqrt().expand(2, 3, 7)
     equations = rows(proj[:, None], pixels.transpose(1, 2))
     stacked = (equations * weights.transpose(1, 2)[..., None, None]).flatten(-3, -2)
