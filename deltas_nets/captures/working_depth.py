@@ -19,9 +19,7 @@ photos for structure from motion are taken about that far apart."""
 
 def knows_its_scale(capture: Capture) -> bool:
     """Whether working depths follow from the capture itself: nobody need look first."""
-    if capture.metric or capture.depth_ranges is not None:
-        return True
-    return bool(np.isfinite(typical_depths(capture)).any())
+    return capture.depth_ranges is not None or bool(np.isfinite(typical_depths(capture)).any())
 
 
 def working_depths(capture: Capture) -> FloatArray:

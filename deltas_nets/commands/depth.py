@@ -110,7 +110,12 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.captures.working_depth import knows_its_scale
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
         from deltas_nets.predict.capture import predict_capture
-        from deltas_nets.predict.first_look import ANCHORS, ROUNDS, depth_seen
+        from deltas_nets.predict.first_look import (
+            ANCHORS,
+            ROUNDS,
+            depth_seen,
+            elsewhere_than_in_rooms,
+        )
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
@@ -121,9 +126,12 @@ class Depth(Captured, Measuring, Prediction):
             predictor.check_measured()
         capture = self.in_metres(capture, predictor, config)
         depth = None
-        if not knows_its_scale(capture):  # then a few maps tell, before views are chosen
+        if not knows_its_scale(capture) and not (capture.metric and self.views == 1):
+            # Then a few maps tell, before views are chosen.
+            threads = self._threads(ANCHORS)
             with progress("first look", ROUNDS * ANCHORS) as report:
-                depth = depth_seen(predictor, capture, config, report=report)
+                depth = depth_seen(predictor, capture, config, threads=threads, report=report)
+            depth = elsewhere_than_in_rooms(depth, capture)
         few = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
             found = lone_frames(capture, self.view_sets, few)
@@ -147,7 +155,7 @@ class Depth(Captured, Measuring, Prediction):
             if self._passes > 1
             else ()
         )
-        search = self._search(capture, [views.anchor for views in mine])
+        search = self._search(capture, depth, [views.anchor for views in mine])
         threads = self._threads(len(mine))
         config = self._sized(config, predictor, capture, found.view_sets, search, threads)
         folder = self._folder(capture, found, shard, options, predictor, config)
@@ -171,7 +179,7 @@ class Depth(Captured, Measuring, Prediction):
         if self.page:
             show(capture, self.folder, self.range)
 
-    def _search(self, capture: "Capture", anchors: list[str]) -> "Search":
+    def _search(self, capture: "Capture", depth: float | None, anchors: list[str]) -> "Search":
         from deltas_nets.predict.search import Asked, Completed, Followed
 
         measured = self.measured(capture)
@@ -180,7 +188,7 @@ class Depth(Captured, Measuring, Prediction):
             self.check_completes(measured, capture, anchors)
             return Completed(capture, measured)
         if self.depth_range is None:
-            return Followed(capture, measured)
+            return Followed(capture, measured, as_rooms=depth is None)
         return Asked(capture, self.depth_range, measured)
 
     def _sized(

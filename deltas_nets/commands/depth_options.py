@@ -52,6 +52,8 @@ def fitting_options(
     from deltas_nets.outputs.products import OWN_UNIT, check_depth_fits, steps_to
 
     far = depth_range[1] if depth_range else farthest_depth(capture)
+    if depth is not None and not depth_range:
+        far = max(far, 4 * depth)  # as much farther as a room is searched
     if not capture.metric:
         options = replace(options, unit=OWN_UNIT)
         usual = float(working_depths(capture).max()) if depth is None else depth

@@ -15,14 +15,16 @@ from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.captures.working_depth import guessed_depth, knows_its_scale, working_depths
+from deltas_nets.check.workers import side_by_side
 from deltas_nets.errors import UserError
+from deltas_nets.network.unit import AS_IN_ROOMS
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.look import found_depths
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Followed
 from deltas_nets.terminal import warn
 
-__all__ = ["depth_seen", "scale_by_measurements", "scale_by_sensor"]
+__all__ = ["depth_seen", "elsewhere_than_in_rooms", "scale_by_measurements", "scale_by_sensor"]
 
 ANCHORS = 5
 """Frames that are looked at."""
@@ -40,14 +42,18 @@ def depth_seen(
     capture: Capture,
     config: PredictConfig,
     *,
+    threads: int = 1,
     report: Callable[[str], None] = lambda _: None,
 ) -> float:
     """How far typical surfaces are, in the capture's unit: as it knows, or as a first look finds.
+
+    A metre tells nothing of that: captures in metres are of a desk, a room or a street.
 
     Args:
         predictor: of a trained network.
         capture: the frames.
         config: all but the range.
+        threads: maps computed at once.
         report: called with the id of every frame that was looked at, ``ANCHORS`` at a time.
 
     Raises:
@@ -55,19 +61,28 @@ def depth_seen(
     """
     if knows_its_scale(capture):
         return float(np.median(working_depths(capture)))
-    search, depth = Followed(capture), guessed_depth(capture)
+    search, depth = Followed(replace(capture, metric=False)), guessed_depth(capture)
+
+    def look(views: ViewSet) -> FloatArray:
+        depths = found_depths(search(predictor, views, config).map)
+        report(views.anchor)
+        return depths
+
     for _ in range(ROUNDS):
-        medians = []
-        for views in _some(capture, working_depth=depth):
-            depths = found_depths(search(predictor, views, config).map)
-            medians += [float(np.median(depths))] if len(depths) else []
-            report(views.anchor)
+        found = side_by_side(look, _some(capture, working_depth=depth), threads)
+        medians = [float(np.median(depths)) for depths in found if len(depths)]
         if not medians:
             break
         before, depth = depth, float(np.median(medians))
         if 1 / AGREES < depth / before < AGREES:
             break
     return depth
+
+
+def elsewhere_than_in_rooms(depth: float, capture: Capture) -> float | None:
+    """The depth that was seen, or None where the capture knows better or is of a usual room."""
+    as_in_rooms = capture.metric and AS_IN_ROOMS[0] <= depth <= AS_IN_ROOMS[1]
+    return None if as_in_rooms or knows_its_scale(capture) else depth
 
 
 def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfig) -> float:

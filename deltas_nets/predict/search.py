@@ -91,10 +91,14 @@ class Followed:
     Args:
         capture: the frames.
         measured: depth that joins the triangulated points, if any.
+        as_rooms: whether surfaces of a capture in metres that says nothing else are expected to be
+            as far as in rooms.
     """
 
-    def __init__(self, capture: Capture, measured: Measured | None = None) -> None:
-        self.capture = capture
+    def __init__(
+        self, capture: Capture, measured: Measured | None = None, *, as_rooms: bool = True
+    ) -> None:
+        self.capture, self.as_rooms = capture, as_rooms and capture.metric
         self.measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
@@ -108,7 +112,7 @@ class Followed:
             reach, sure = reach_within(near, far, metric=metric), True
         elif points is not None:
             reach, sure = reach_of(points[:, 2], metric=metric), True
-        elif metric:
+        elif self.as_rooms:
             reach, sure = Reach(*ROOM), True
         else:
             reach, sure = _by_baseline(frames), False
