@@ -100,7 +100,7 @@ def sample_segments(
     pixels = torch.addcmul(start.unsqueeze(-2), of_pixels.unsqueeze(-1), along.unsqueeze(-2))
 
     pixels = pixels.unsqueeze(-3)
-    if offsets:
+    if len(offsets):  # a tensor and an array have no truth value
         length = along.square().sum(-1, keepdim=True)
         moving = length > 0
         unit = along * torch.where(moving, length, 1.0).rsqrt()

@@ -98,7 +98,7 @@ def soft_argmax(
     positions, known = finite_or_zero(positions, limit=torch.finfo(positions.dtype).max ** 0.25)
     logits, finite = finite_or_zero(logits.expand(*batch, -1), dims=0)
     possible = both(both(mask, finite), None if known is None else known[..., 0])
-    lowest = torch.finfo(logits.dtype).min / 4
+    lowest = torch.finfo(logits.dtype).min
     probability = only(only(logits, possible, other=lowest).softmax(dim=-1), possible)
     peak, place = probability.max(dim=-1)
     entropy = -torch.special.xlogy(probability, probability.clamp_min(1e-30)).sum(dim=-1)
@@ -195,9 +195,17 @@ def match_per_view(
         samples: the places scored.
         window: see :func:`soft_argmax`; only without offsets (O = 1).
 
+    Raises:
+        ShapeError: scores and samples are not of the same sources and places.
+        ValueError: a window, and lines beside each other.
+
     Source: the paper, section 3.2, equations 2 and 3.
     """
-    check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N O M"))
+    check_shapes(
+        keypoints=(keypoints, "N 2"),
+        scores=(scores, "sources N O S"),
+        samples=(samples.pixels, "sources N O S 2"),
+    )
     if window is not None and scores.shape[-2] != 1:
         raise ValueError("window needs samples without offsets: steps are along one line")
     found = soft_argmax(
@@ -241,10 +249,16 @@ def match_joint(
         peak of the joint distribution.
 
     Raises:
+        ShapeError: scores and samples are not of the same sources and places, or there is none.
         ValueError: each source has inverse depths of its own; not noticed where values are not on
             the CPU, or traced.
     """
-    check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N 1 M"))
+    check_shapes(
+        keypoints=(keypoints, "N 2"),
+        scores=(scores, "+sources N 1 S"),
+        samples=(samples.pixels, "sources N 1 S 2"),
+        inv_depth=(samples.inv_depth, "sources N S"),
+    )
     check_bool(mask=samples.mask)
     scores, finite = finite_or_zero(scores.squeeze(-2), dims=0)
     seen = only(samples.mask.squeeze(-2), finite, other=False)
