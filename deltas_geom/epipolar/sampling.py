@@ -37,6 +37,16 @@ class Samples(Record):
     mask: Tensor
 
 
+def check_scores(keypoints: Tensor, scores: Tensor, samples: Samples, dims: str) -> None:
+    """Raise as :func:`check_shapes` unless scores of these dims are of the samples of keypoints."""
+    check_shapes(
+        keypoints=(keypoints, "N 2"),
+        scores=(scores, dims),
+        samples=(samples.pixels, f"{dims} 2"),
+        inv_depth=(samples.inv_depth, "sources N S"),
+    )
+
+
 @without_autocast
 def sample_segments(
     segments: Segments,
