@@ -123,10 +123,6 @@ def _mean(index: Tensor, depth: Tensor, weight: Tensor, size: int) -> tuple[Tens
 
 def _front(index: Tensor, depth: Tensor, weight: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Depth and weight of the nearest point of each pixel."""
-    count = index.shape[-1]
-    if count == 0:
-        empty = depth.new_zeros(*index.shape[:-1], size)
-        return empty, empty
     # Two minima, of depth and then of number among the nearest, do not depend on the order in
     # which a device writes, and are exact in every dtype.
     falls = weight > 0
@@ -134,11 +130,15 @@ def _front(index: Tensor, depth: Tensor, weight: Tensor, size: int) -> tuple[Ten
     nearest = depth.new_full((*index.shape[:-1], size), torch.inf)
     nearest = nearest.scatter_reduce(-1, index, key, reduce="amin")
     wins = falls & (key == nearest.gather(-1, index))
+    count = index.shape[-1]
     number = torch.arange(count, device=index.device).expand(index.shape)
-    winner = torch.full_like(nearest, count, dtype=torch.int64)
-    winner = winner.scatter_reduce(-1, index, torch.where(wins, number, count), reduce="amin")
-    filled = winner < count
-    winner = torch.where(filled, winner, 0)
-    taken_depth = torch.where(filled, depth.gather(-1, winner), 0.0)
-    taken_weight = torch.where(filled, weight.gather(-1, winner), 0.0)
+    first = torch.full_like(nearest, count, dtype=torch.int64)
+    first = first.scatter_reduce(-1, index, torch.where(wins, number, count), reduce="amin")
+    wins = wins & (number == first.gather(-1, index))
+    # One point of a pixel wins, so that a sum is what it has. Points are few, pixels many: to look
+    # up each pixel's winner takes twice as long.
+    empty = torch.zeros_like(nearest)
+    taken_depth, taken_weight = (
+        empty.scatter_add(-1, index, torch.where(wins, value, 0.0)) for value in (depth, weight)
+    )
     return taken_depth, taken_weight

@@ -73,7 +73,8 @@ def unproject(views: PosedViews, pixels: Tensor, depth: Tensor) -> Tensor:
 
     Returns:
         ``(*B, V, N, 3)`` world points, metres; (0, 0, 0) with zero gradient where the pixel, the
-        depth (as sensors mark it unknown) or the camera is not finite.
+        depth (as sensors mark it unknown) or the camera is not finite. A depth of 0, as others
+        mark it, is the camera's centre.
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.

@@ -9,10 +9,17 @@ from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import ShapeError, check_batch, check_kind, check_positive
 from deltas_geom.diagnosis.causes import Cause
-from deltas_geom.diagnosis.evidence import SHARE, Evidence, displacements, gather_evidence
+from deltas_geom.diagnosis.evidence import (
+    CHANCE,
+    SHARE,
+    Evidence,
+    displacements,
+    gather_evidence,
+)
 from deltas_geom.diagnosis.hypotheses import Hypothesis, pixels_at, resized, shifted
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.telling import Told
+from deltas_geom.diagnosis.threes import off_in_threes
 from deltas_geom.diagnosis.trials import (
     Trial,
     all_trials,
@@ -24,9 +31,6 @@ from deltas_geom.diagnosis.trials import (
 )
 
 _SAME = 1.25  # times as much is as good
-# Few matches can be fitted by accident, with a factor or a shift to choose: of a dozen, one wants
-# more than a quarter. Chance has deviations of a share of 0.5 / sqrt(count).
-_CHANCE = 1.2
 _JUDGED_OTHERWISE = (Cause.CAMERA_DISAGREES, Cause.POINTS_AS_VIEWS)  # not by the pairs as given
 
 
@@ -42,8 +46,9 @@ def diagnose(
     what a view sees of another view's ray, which ends at the epipole and at infinity, so that
     points behind cameras count as wrong; a quarter of the matches of a pair of views must fit, and
     more of few matches, of which a quarter fits by accident. So up to 30 % of the pixels may be
-    wrong. For people and commands: it looks at values, computes in float64 on the CPU, and has no
-    gradients.
+    wrong. Pairs do not see an error along their lines: where they fit, the points of three views
+    and more must fit, too, each camera a tenth of its own. For people and commands: it looks at
+    values, computes in float64 on the CPU, and has no gradients.
 
     What matches cannot tell is not guessed: causes that explain as much are all named
     (``alternatives``), and where all is well, those whose cure would change nothing (``untold``).
@@ -92,12 +97,12 @@ def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float
     ranked = sorted([given, *trials], key=lambda trial: float(trial.residual.mean()))
     told = told._replace(ranking=tuple(trial.explanation() for trial in ranked))
     if chosen is None:
-        return _without_cause(told, trials, evidence, threshold)
+        return _without_cause(told, trials, evidence, where, threshold)
     if chosen.what.cause in _JUDGED_OTHERWISE:
         return told.says(chosen.what, chosen)
     fitting = partial(share_fitting, evidence=evidence, limit=2 * threshold)
     share, count = fitting(chosen)
-    if share < SHARE + _CHANCE / count**0.5:
+    if share < SHARE + CHANCE / count**0.5:
         return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
     limit = _SAME * float(chosen.residual[chosen.concerned].mean()) + 0.05
     same = [
@@ -176,7 +181,7 @@ def _disagreeing(given: Trial, evidence: Evidence, threshold: float) -> Trial | 
 
 
 def _without_cause(
-    told: Told, trials: list[Trial], evidence: Evidence, threshold: float
+    told: Told, trials: list[Trial], evidence: Evidence, pixels: Tensor, threshold: float
 ) -> Diagnosis:
     """All is well, nothing has parallax, or nothing explains it."""
     given = told.given
@@ -191,6 +196,9 @@ def _without_cause(
         return told.says(given.what._replace(cause=Cause.NO_BASELINE), moves=moves)
     if not _well(given.residual, evidence, len(K), threshold):
         return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
+    apart = off_in_threes(K, pose, pixels, told.seen, 2 * threshold)
+    if bool((apart > 0).any()):
+        return _contradicted(told, evidence, apart)
     trials = [trial for trial in trials if not trial.what.cameras]
     trials.append(tried(Hypothesis(Cause.CROPPED, (), None, shifted(K, 20.0), pose), evidence))
     for factor in (0.5, 2.0):
@@ -199,6 +207,20 @@ def _without_cause(
     limit = _SAME * residual + 0.05
     untold = [trial.explanation() for trial in trials if level(trial.residual) <= limit]
     return told.says(given.what)._replace(untold=tuple(untold))
+
+
+def _contradicted(told: Told, evidence: Evidence, apart: Tensor) -> Diagnosis:
+    """Pairs of views agree, but cameras are off ``(V)`` px from the points of the others."""
+    given = told.given
+    residual = torch.maximum(given.residual, apart[evidence.pairs].amax(dim=-1))
+    cameras = tuple((apart > 0).nonzero().flatten().tolist())
+    concerned = evidence.with_camera(*cameras)
+    given = given._replace(residual=residual)
+    told = told._replace(given=given, cameras=by_camera(residual, evidence, len(apart)))
+    if len(cameras) > 1 or bool(concerned.all()):
+        return told.says(given.what._replace(cause=Cause.NO_SINGLE_CAUSE))
+    what = given.what._replace(cause=Cause.CAMERA_DISAGREES, cameras=cameras)
+    return told.says(what, Trial(what, residual, concerned))
 
 
 def _well(residual: Tensor, evidence: Evidence, views: int, limit: float) -> bool:

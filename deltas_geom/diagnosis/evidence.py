@@ -7,6 +7,9 @@ from torch import Tensor
 
 LEAST_MATCHES = 8  # of a pair of views
 SHARE = 1 / 4  # of a pair's matches must fit: with 30 % wrong pixels, half of them can
+# Few matches can be fitted by accident, with a factor or a shift to choose: of a dozen, one wants
+# more than a quarter. Chance has deviations of a share of 0.5 / sqrt(count).
+CHANCE = 1.2
 CAP = 50.0  # px: beyond, wrong is wrong
 _PARTNERS = 5  # of each view
 _MOST = 96  # matches looked at in a pair

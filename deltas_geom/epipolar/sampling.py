@@ -37,6 +37,16 @@ class Samples(Record):
     mask: Tensor
 
 
+def check_scores(keypoints: Tensor, scores: Tensor, samples: Samples, dims: str) -> None:
+    """Raise as :func:`check_shapes` unless scores of these dims are of the samples of keypoints."""
+    check_shapes(
+        keypoints=(keypoints, "N 2"),
+        scores=(scores, dims),
+        samples=(samples.pixels, f"{dims} 2"),
+        inv_depth=(samples.inv_depth, "sources N S"),
+    )
+
+
 @without_autocast
 def sample_segments(
     segments: Segments,
@@ -100,7 +110,7 @@ def sample_segments(
     pixels = torch.addcmul(start.unsqueeze(-2), of_pixels.unsqueeze(-1), along.unsqueeze(-2))
 
     pixels = pixels.unsqueeze(-3)
-    if offsets:
+    if len(offsets):  # a tensor and an array have no truth value
         length = along.square().sum(-1, keepdim=True)
         moving = length > 0
         unit = along * torch.where(moving, length, 1.0).rsqrt()

@@ -11,7 +11,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import batch_shape, check_batch, check_bool, check_positive, check_shapes
-from deltas_geom.epipolar.sampling import Samples, sample_inv_depths
+from deltas_geom.epipolar.sampling import Samples, check_scores, sample_inv_depths
 from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
@@ -98,8 +98,8 @@ def soft_argmax(
     positions, known = finite_or_zero(positions, limit=torch.finfo(positions.dtype).max ** 0.25)
     logits, finite = finite_or_zero(logits.expand(*batch, -1), dims=0)
     possible = both(both(mask, finite), None if known is None else known[..., 0])
-    lowest = torch.finfo(logits.dtype).min / 4
-    probability = only(only(logits, possible, other=lowest).softmax(dim=-1), possible)
+    least = torch.finfo(logits.dtype).min
+    probability = only(only(logits, possible, other=least).softmax(dim=-1), possible)
     peak, place = probability.max(dim=-1)
     entropy = -torch.special.xlogy(probability, probability.clamp_min(1e-30)).sum(dim=-1)
     near = probability
@@ -135,10 +135,9 @@ def matches_from_sources(
         sources = (pixels, -3), (weights, -2), (covariance, -4), (mask, -2)
         pixels, weights, covariance, mask = (x.expand(*batch, *x.shape[d:]) for x, d in sources)
     anchor = keypoints.expand(*batch, *keypoints.shape[-2:]).unsqueeze(-3)
-    ones = torch.ones_like(weights[..., :1, :])
     return Matches(
         torch.cat([anchor, pixels], dim=-3),
-        torch.cat([ones, weights], dim=-2),
+        torch.cat([torch.ones_like(weights[..., :1, :]), weights], dim=-2),
         torch.cat([torch.zeros_like(covariance[..., :1, :, :, :]), covariance], dim=-4),
         torch.cat([only(torch.ones_like(mask[..., :1, :]), known, other=False), mask], dim=-2),
     )
@@ -195,9 +194,12 @@ def match_per_view(
         samples: the places scored.
         window: see :func:`soft_argmax`; only without offsets (O = 1).
 
+    Raises:
+        ShapeError: scores are of other samples.
+
     Source: the paper, section 3.2, equations 2 and 3.
     """
-    check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N O M"))
+    check_scores(keypoints, scores, samples, "sources N O S")
     if window is not None and scores.shape[-2] != 1:
         raise ValueError("window needs samples without offsets: steps are along one line")
     found = soft_argmax(
@@ -241,10 +243,11 @@ def match_joint(
         peak of the joint distribution.
 
     Raises:
+        ShapeError: scores are of other samples, or there is no source.
         ValueError: each source has inverse depths of its own; not noticed where values are not on
             the CPU, or traced.
     """
-    check_shapes(keypoints=(keypoints, "N 2"), scores=(scores, "S N 1 M"))
+    check_scores(keypoints, scores, samples, "+sources N 1 S")
     check_bool(mask=samples.mask)
     scores, finite = finite_or_zero(scores.squeeze(-2), dims=0)
     seen = only(samples.mask.squeeze(-2), finite, other=False)

@@ -40,7 +40,9 @@ def slack() -> float:
     return _SLACK.get()
 
 
-def assert_near(found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: str) -> None:
+def assert_near(
+    found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: str, dims: str = ""
+) -> None:
     """Raise ``AssertionError`` with the worst pair unless all are as close; NaN is not.
 
     Args:
@@ -48,6 +50,7 @@ def assert_near(found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: 
         wanted: of the same shape.
         tolerance: largest difference, or one for each entry; times :func:`slack`.
         unit: of both, for the message.
+        dims: what the dims are, but the last, which are x, y and z; without them they are numbers.
 
     Example:
         >>> assert_near(torch.tensor([1.0, 2.5]), torch.tensor([1.0, 2.0]), 0.1, "m")
@@ -65,7 +68,7 @@ def assert_near(found: Tensor, wanted: Tensor, tolerance: float | Tensor, unit: 
         index = _index(int(torch.where(bad, excess, -1.0).argmax()), error)
         raise AssertionError(
             f"{float(found[index]):.9g} instead of {float(wanted[index]):.9g} at "
-            f"{list(index)}: off by {float(error[index]):.2g}, "
+            f"{_place(index, dims.split())}: off by {float(error[index]):.2g}, "
             f"allowed {float(allowed[index]):.2g} {unit}"
         )
 
@@ -186,6 +189,14 @@ def differences(
 
 def _index(place: int, tensor: Tensor) -> tuple[int, ...]:
     return tuple(int(i) for i in torch.unravel_index(torch.tensor(place), tensor.shape))
+
+
+def _place(index: tuple[int, ...], dims: list[str]) -> str:
+    """Where an entry is: "view 1, point 0, y" or, of dims without names, "[1, 0, 1]"."""
+    if len(index) != len(dims) + 1 or not dims:
+        return str(list(index))
+    named = [f"{dim} {at}" for dim, at in zip(dims, index, strict=False)]
+    return ", ".join([*named, "xyz"[index[-1]]])
 
 
 def _name(code: int) -> str:

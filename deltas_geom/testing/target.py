@@ -55,8 +55,8 @@ class Target:
         max_views: the most views that ``triangulate``, ``judge``, ``refine``, ``residual``,
             ``parallax`` and ``robust`` take; None = any number.
         weighted: whether they heed weights; if not, they are called with None.
-        differentiable: whether autograd goes through ``triangulate``, ``project`` and
-            ``soft_argmax``.
+        differentiable: whether autograd goes through ``triangulate``, ``project``,
+            ``sample_map`` and ``soft_argmax``.
         batched: whether ``triangulate`` takes leading batch dims, broadcast against each other.
         judge: as ``triangulate``, but ``-> status (N)`` of the points.
         refine: ``(proj (V, 3, 4), pixels (V, N, 2), points (N, 3), weights (V, N) or None) ->

@@ -20,8 +20,9 @@ class PreparedTriangulator:
     """Keeps what depends on the cameras alone; :meth:`Triangulator.prepare` makes it.
 
     Answers and gradients, also those by the cameras, are those of :func:`triangulate`. Cameras that
-    are changed in place are noticed, and looked at anew; not so a NumPy array behind ``proj``. It
-    is no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to` moves it.
+    are changed in place are noticed, and looked at anew; not so through ``proj.data`` or a NumPy
+    array behind ``proj``. It is no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to`
+    moves it.
 
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].

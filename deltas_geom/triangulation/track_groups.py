@@ -72,7 +72,13 @@ def check_range(
     ends = (("camera_index", camera_index, num_cameras), ("point_index", point_index, num_points))
     for name, index, count in ends:
         if len(index) and not 0 <= int(index.min()) <= int(index.max()) < count:
-            raise IndexError(f"{name} must be from 0 to {count - 1}: leave out COLMAP's -1")
+            known = index.long()
+            place = int(((known < 0) | (known >= count)).nonzero()[0])
+            cure = ": leave out COLMAP's -1" if known[place] == -1 else ""
+            raise IndexError(
+                f"{name} must be from 0 to {count - 1}, got {int(known[place])} of observation "
+                f"{place}{cure}"
+            )
 
 
 class Groups(NamedTuple):
@@ -149,4 +155,4 @@ def seen_by(
 
 def rows_at(values: Tensor, index: Tensor) -> Tensor:
     """Rows of values, by an index of any shape."""
-    return values.index_select(0, index.flatten()).reshape(*index.shape, *values.shape[1:])
+    return values.index_select(0, index.flatten().long()).reshape(*index.shape, *values.shape[1:])

@@ -95,7 +95,7 @@ def triangulate_robust_tracks(
         covariance=covariance,
     )
     status = torch.where(agreed, tracks.status, reason)
-    used = inliers & tracks.valid.index_select(0, point_index)
+    used = inliers & rows_at(tracks.valid, point_index)
     return tracks._replace(status=status, used=used)
 
 

@@ -374,6 +374,10 @@ def test_the_fixed_scenes_come_smallest_first() -> None:
 def test_an_assertion_names_the_worst_entry_and_a_wrong_shape() -> None:
     with pytest.raises(AssertionError, match=r"nan instead of 2 at \[1\]"):
         assert_near(torch.tensor([1.5, torch.nan]), torch.tensor([1.0, 2.0]), 0.1, "m")
+    off = torch.zeros(2, 3, 2)
+    off[1, 0, 1] = 2
+    with pytest.raises(AssertionError, match=r"instead of 0 at view 1, point 0, y: off by 2"):
+        assert_near(off, torch.zeros(2, 3, 2), 0.1, "px", "view point")
     with pytest.raises(AssertionError, match=r"shape \(2,\) instead of \(3,\)"):
         assert_near(torch.zeros(2), torch.zeros(3), 0.1, "m")
     wanted = torch.tensor([Status.OK, Status.EMPTY])

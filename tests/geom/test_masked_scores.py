@@ -34,6 +34,12 @@ def test_a_logit_that_is_not_finite_is_a_masked_place(
     assert gradient.isfinite().all() and (gradient[~kept] == 0).all()
 
 
+def test_the_least_of_logits_is_not_masked_for_another() -> None:
+    logits = torch.tensor([-3e38, -2e38, 0.0])
+    found = soft_argmax(logits, torch.arange(3.0)[:, None], mask=torch.tensor([True, True, False]))
+    assert found.position.item() == 1 and found.peak == 1
+
+
 @pytest.mark.parametrize("value", LEFT_OUT)
 def test_scores_that_are_not_finite_are_samples_not_seen(value: float) -> None:
     inputs = inputs_in(torch.float64)

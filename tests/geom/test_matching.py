@@ -38,6 +38,29 @@ def test_wrong_arguments_are_named() -> None:
         match_per_view(torch.zeros(5, 2), samples.pixels[..., 0], samples, window=1)
 
 
+def test_scores_of_other_samples_are_named() -> None:
+    views, _, pixels = seeded_scene(0, num_views=3, num_points=4)
+    samples = sample_inv_depths(views, pixels[0], INV_DEPTHS, image_size=IMAGE_SIZE)
+    # One source's scores for both would broadcast, and be believed.
+    for shape, told in (
+        ((1, 4, 1, 31), "samples has sources = 2 but scores has sources = 1"),
+        ((2, 4, 1, 30), "samples has S = 31 but scores has S = 30"),
+        ((2, 3, 1, 31), "scores has N = 3 but keypoints has N = 4"),
+    ):
+        scores = torch.zeros(shape).double()
+        with pytest.raises(ShapeError, match=told):
+            match_per_view(pixels[0], scores, samples)
+        with pytest.raises(ShapeError, match=told):
+            match_joint(views, pixels[0], scores, samples, image_size=IMAGE_SIZE)
+    with pytest.raises(ShapeError, match="samples has N = 4 but keypoints has N = 1"):
+        match_per_view(pixels[0, :1], torch.zeros(2, 1, 1, 31).double(), samples)
+    none = samples._replace(
+        pixels=samples.pixels[:0], inv_depth=samples.inv_depth[:0], mask=samples.mask[:0]
+    )
+    with pytest.raises(ShapeError, match="scores must have sources >= 1"):
+        match_joint(views, pixels[0], torch.zeros(0, 4, 1, 31), none, image_size=IMAGE_SIZE)
+
+
 def test_wrong_covariances_and_floors_are_named() -> None:
     with pytest.raises(ShapeError, match="covariance must have shape"):
         weights_from_covariance(torch.zeros(4, 2))

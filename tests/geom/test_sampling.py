@@ -1,5 +1,9 @@
 """Places along segments, and feature maps read at pixels."""
 
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -52,6 +56,14 @@ def test_wrong_arguments_are_named() -> None:
         sample_map(torch.zeros(4, 4), torch.zeros(1, 2), image_size=(4, 4))
     with pytest.raises(ShapeError, match="inv_depths must have shape"):
         sample_inv_depths(scene.views, scene.pixels[0], torch.tensor(1.0), image_size=(4, 4))
+
+
+@pytest.mark.parametrize("kind", [list, torch.tensor, np.array])
+def test_offsets_are_any_row_of_numbers(kind: Callable[[list[float]], Any]) -> None:
+    segments = segments_of(forward_motion())
+    for offsets in ([], [-1.0, 0.5]):
+        found = sample_segments(segments, 3, offsets=kind(offsets)).pixels
+        assert torch.equal(found, sample_segments(segments, 3, offsets=tuple(offsets)).pixels)
 
 
 @given(scene=posed_scenes(), count=st.integers(2, 9))

@@ -107,6 +107,28 @@ def test_no_observations_and_no_points_are_no_error(cameras: int, points: int) -
     assert torch.equal(noise, torch.zeros(points, 3, 3))
 
 
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int8, torch.int16, torch.int32])
+def test_indices_are_integers_of_any_size(kind: torch.dtype) -> None:
+    scene = forward_motion()
+    pixels, camera, point = all_of(scene)
+    proj, ones = scene.views.proj, torch.ones(len(camera)).double()
+
+    def found(camera: Tensor, point: Tensor) -> tuple[Tensor, ...]:
+        robust = geom.triangulate_robust_tracks(proj, pixels, camera, point, 3)
+        refined = geom.refine_tracks(proj, pixels, scene.points, camera, point)
+        poses = POSES[: len(proj)]
+        noise = (
+            geom.track_covariance(proj, scene.points, camera, point, ones, pose_covariance=known)
+            for known in (None, poses)
+        )
+        return robust.points, robust.within_depth((0.1, 100.0)).points, refined.points, *noise
+
+    for ours, wanted in zip(
+        found(camera.to(kind), point.to(kind)), found(camera, point), strict=True
+    ):
+        assert torch.equal(ours, wanted)
+
+
 def test_wrong_arguments_are_named() -> None:
     proj, pixels, index = torch.ones(2, 3, 4), torch.ones(5, 2), torch.zeros(5).long()
     points, ones = torch.ones(1, 3), torch.ones(5)

@@ -74,6 +74,7 @@ FOUND = {
     ),
     "reading_follows_a_shift_of_the_map": "aligned corners | map y, x | brighter to the right",
     "reading_is_linear_in_the_map": "clamped | brighter to the right",
+    "gradients_of_what_is_read_are_finite_differences": "places detached",
     "what_is_read_is_finite": "unbounded",
     "correlating_is_reading_and_multiplying": "cosine",
     "the_soft_argmax_is_the_mean_under_the_softmax": "half as warm | argmax + 1e-3 | no mask",

@@ -119,11 +119,15 @@ def test_indices_of_tracks_are_integers(kind: torch.dtype) -> None:
         geom.triangulate_tracks(proj, pixels, index.to(kind), index, 2)
     with pytest.raises(TypeError, match="point_index must hold integers"):
         geom.triangulate_tracks(proj, pixels, index, index.to(kind), 2)
-    for camera in (index + 1, index - 1):
-        with pytest.raises(IndexError, match="camera_index must be from 0 to 1: leave out COLMAP"):
-            geom.triangulate_tracks(proj, pixels, camera, index, 2)
-        with pytest.raises(IndexError, match="point_index must be from 0 to 1"):
-            geom.triangulate_tracks(proj, pixels, index, camera, 2)
+    for wrong, told in (
+        (index + 1, "2 of observation 1$"),
+        (index - 1, "-1 of observation 0: leav"),
+    ):
+        for kind in (torch.int64, torch.int8):
+            with pytest.raises(IndexError, match=f"camera_index must be from 0 to 1, got {told}"):
+                geom.triangulate_tracks(proj, pixels, wrong.to(kind), index, 2)
+            with pytest.raises(IndexError, match=f"point_index must be from 0 to 1, got {told}"):
+                geom.triangulate_tracks(proj, pixels, index, wrong.to(kind), 2)
 
 
 PROJ, PIXELS = torch.eye(3, 4).expand(2, 3, 4), torch.zeros(2, 6, 2)

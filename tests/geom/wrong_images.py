@@ -76,6 +76,7 @@ WRONG = [
     Target("aligned corners", sample_map=aligned),
     before("map at 0.5", "sample_map", lambda m, x, size: (m, x + 0.5, size)),
     before("map y, x", "sample_map", lambda m, x, size: (m, x.flip(-1), size)),
+    before("places detached", "sample_map", lambda m, x, size: (m, x.detach(), size)),
     Target("nearest cell", sample_map=nearest_cell),
     after("clamped", "sample_map", torch.relu),
     Target(

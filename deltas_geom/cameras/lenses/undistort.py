@@ -101,7 +101,8 @@ def undistort_image(
         lens: which saw the image, one or ``*B``.
         image: ``(*B, C, H, W)``; a number that is NaN or infinite counts as 0.
         new_K: ``(*B, 3, 3)`` of the pinhole camera. Without it it looks through the same centre at
-            a rectangle that ``alpha`` tells.
+            a rectangle that ``alpha`` tells, and which is chosen without gradient: that of the
+            image by the lens is for this K held.
         new_size: (height, width) of the result; as the image without it.
         alpha: 0: every pixel of the result was seen; 1: every pixel of the image is in the
             result, with black around it; between, a mixture, as in OpenCV's

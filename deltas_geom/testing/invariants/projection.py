@@ -26,7 +26,7 @@ def pixels_are_those_of_the_camera_equations(
     """A pixel is K [R | t] X divided by its last coordinate, skew included."""
     homogeneous = to_homogeneous(scene.points) @ scene.views.proj.mT
     wanted = homogeneous[..., :2] / homogeneous[..., 2:]
-    assert_near(_pixels(target, scene.views, scene.points), wanted, tolerance, "px")
+    assert_near(_pixels(target, scene.views, scene.points), wanted, tolerance, "px", "view point")
 
 
 @invariant("project")
@@ -39,7 +39,7 @@ def pixels_do_not_know_the_worlds_frame(
 ) -> None:
     """Pixels stay when cameras and points are moved, turned and scaled together."""
     moved = _pixels(target, world.views(scene.views), world.points(scene.points))
-    assert_near(moved, _pixels(target, scene.views, scene.points), tolerance, "px")
+    assert_near(moved, _pixels(target, scene.views, scene.points), tolerance, "px", "view point")
 
 
 @invariant("project")
@@ -50,7 +50,7 @@ def pixels_follow_a_crop_and_a_resize(
     change = cut(scene.views, new_size=(240, 160))
     seen = _pixels(target, scene.views._replace(K=change @ scene.views.K), scene.points)
     wanted = transformed(change, _pixels(target, scene.views, scene.points))
-    assert_near(seen, wanted, tolerance, "px")
+    assert_near(seen, wanted, tolerance, "px", "view point")
 
 
 @invariant("project", "autograd")

@@ -4,7 +4,13 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import pixel_grid
-from deltas_geom.testing.agreement import EXTREMES, VALUE_TOLERANCE, assert_finite, assert_near
+from deltas_geom.testing.agreement import (
+    EXTREMES,
+    VALUE_TOLERANCE,
+    assert_finite,
+    assert_gradients,
+    assert_near,
+)
 from deltas_geom.testing.planar import MapScene
 from deltas_geom.testing.registry import invariant
 from deltas_geom.testing.target import Target
@@ -56,6 +62,21 @@ def reading_is_linear_in_the_map(target: Target, scene: MapScene) -> None:
         for one in (scene.feature_map, other)
     ]
     assert_near(found, 2 * alone[0] - 3 * alone[1], VALUE_TOLERANCE, "(value)")
+
+
+@invariant("sample_map", "autograd", scenes="maps")
+def gradients_of_what_is_read_are_finite_differences(target: Target, scene: MapScene) -> None:
+    """Between centres of cells the gradient by map and pixels is that of finite differences."""
+    # At a centre what is read has a kink.
+    height, width = scene.feature_map.shape[1:]
+    inner = _centers(scene).reshape(height, width, 2)[:-1, :-1].flatten(0, 1)
+    stride_y, stride_x = _stride(scene)
+    pixels = inner + 0.3 * inner.new_tensor([stride_x, stride_y])
+
+    def read(feature_map: Tensor, pixels: Tensor) -> Tensor:
+        return _read(target, scene._replace(feature_map=feature_map), pixels)
+
+    assert_gradients(read, [scene.feature_map, pixels], ("feature_map", "pixels"), "(value)")
 
 
 @invariant("sample_map", scenes="maps")

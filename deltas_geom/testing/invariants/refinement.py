@@ -41,7 +41,7 @@ def an_exact_point_is_not_moved(
     weights = weights_for(target, scene, weights)
     exact = scene._replace(pixels=project(scene.views, scene.points).pixels)
     found = _refined(target, exact, scene.points, weights)
-    assert_near(found, scene.points, POINT_TOLERANCE, "m")
+    assert_near(found, scene.points, POINT_TOLERANCE, "m", "point")
 
 
 def _refined(target: Target, scene: PosedScene, start: Tensor, weights: Tensor | None) -> Tensor:

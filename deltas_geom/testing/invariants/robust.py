@@ -47,7 +47,7 @@ def a_view_of_weight_0_does_not_move_a_robust_point(
     assert weights is not None and target.robust is not None
     weights[view] = 0
     points, _ = target.robust(scene.views.proj, pixels, weights, _THRESHOLD)
-    assert_near(points, scene.points, POINT_TOLERANCE, "m")
+    assert_near(points, scene.points, POINT_TOLERANCE, "m", "point")
 
 
 @invariant("robust")
@@ -72,7 +72,7 @@ def robust_points_move_with_the_world(
     """Where cameras are moved, turned and scaled, robust points go with them."""
     moved, _ = _robust(target, scene._replace(views=world.views(scene.views)))
     back = World(invert_pose(world.new_from_world), 1.0).points(moved / world.scale)
-    assert_near(back, _robust(target, scene)[0], POINT_TOLERANCE, "m")
+    assert_near(back, _robust(target, scene)[0], POINT_TOLERANCE, "m", "point")
 
 
 def _robust(target: Target, scene: PosedScene) -> tuple[Tensor, Tensor]:
@@ -88,4 +88,4 @@ def _assert_found(target: Target, scene: PosedScene, right: Tensor) -> None:
         view, point = wrong.nonzero()[0].tolist()
         is_one = "an inlier" if bool(inliers[view, point]) else "no inlier"
         raise AssertionError(f"view {view} is {is_one} of point {point}")
-    assert_near(points, scene.points, POINT_TOLERANCE, "m")
+    assert_near(points, scene.points, POINT_TOLERANCE, "m", "point")

@@ -27,7 +27,7 @@ def points_are_exact_without_noise(
     """The pixels of a point give the point."""
     exact = scene._replace(pixels=project(scene.views, scene.points).pixels)
     found = points_of(target, exact, weights_for(target, scene, weights))
-    assert_near(found, scene.points, POINT_TOLERANCE, "m")
+    assert_near(found, scene.points, POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate")
@@ -38,7 +38,7 @@ def points_move_with_the_world(
     weights = weights_for(target, scene, weights)
     moved = points_of(target, scene._replace(views=world.views(scene.views)), weights)
     back = World(invert_pose(world.new_from_world), 1.0).points(moved / world.scale)
-    assert_near(back, points_of(target, scene, weights), POINT_TOLERANCE, "m")
+    assert_near(back, points_of(target, scene, weights), POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate")
@@ -51,7 +51,11 @@ def points_do_not_know_of_a_crop_and_a_resize(
     views = scene.views._replace(K=change @ scene.views.K)
     halved = PosedScene(views, scene.points, transformed(change, scene.pixels))
     assert_near(
-        points_of(target, halved, weights), points_of(target, scene, weights), POINT_TOLERANCE, "m"
+        points_of(target, halved, weights),
+        points_of(target, scene, weights),
+        POINT_TOLERANCE,
+        "m",
+        "point",
     )
 
 
@@ -68,7 +72,7 @@ def points_do_not_know_the_order_of_views(
     order = order or list(reversed(range(scene.views.num_views)))
     permuted = scene._replace(views=scene.views.select(order), pixels=scene.pixels[order])
     found = points_of(target, permuted, None if weights is None else weights[order])
-    assert_near(found, points_of(target, scene, weights), POINT_TOLERANCE, "m")
+    assert_near(found, points_of(target, scene, weights), POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate")
@@ -82,7 +86,7 @@ def many_points_are_solved_as_each_alone(
         one = slice(point, point + 1)
         single = scene._replace(pixels=scene.pixels[:, one])
         alone.append(points_of(target, single, None if weights is None else weights[:, one]))
-    assert_near(points_of(target, scene, weights), torch.cat(alone), POINT_TOLERANCE, "m")
+    assert_near(points_of(target, scene, weights), torch.cat(alone), POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate", "weights")
@@ -93,7 +97,7 @@ def only_the_ratios_of_weights_count(
     weights = weights_for(target, scene, weights)
     assert weights is not None
     found = points_of(target, scene, factor * weights)
-    assert_near(found, points_of(target, scene, weights), POINT_TOLERANCE, "m")
+    assert_near(found, points_of(target, scene, weights), POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate", "weights", "many views")
@@ -117,7 +121,7 @@ def a_view_of_weight_0_is_a_view_removed(
     spoiled[view] += spoil
     without[view] = 0
     found = points_of(target, scene._replace(pixels=spoiled), without)
-    assert_near(found, points_of(target, removed, weights[rest]), POINT_TOLERANCE, "m")
+    assert_near(found, points_of(target, removed, weights[rest]), POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate", "weights", "many views")
@@ -132,7 +136,7 @@ def a_doubled_view_is_a_doubled_squared_weight(
     doubled = pair._replace(views=pair.views.select(twice), pixels=pair.pixels[twice])
     heavier = weights * torch.tensor([1.0, 2**0.5], dtype=weights.dtype)[:, None]
     found = points_of(target, doubled, weights[twice])
-    assert_near(found, points_of(target, pair, heavier), POINT_TOLERANCE, "m")
+    assert_near(found, points_of(target, pair, heavier), POINT_TOLERANCE, "m", "point")
 
 
 @invariant("triangulate", "weights")
@@ -205,7 +209,7 @@ def float32_is_as_good_as_rounding_the_input(
         )
         effect = torch.maximum(effect, (solve(*rounded) - wanted).abs() / 1e-6)
     bound = roundings * torch.finfo(torch.float32).eps * effect
-    assert_near(solve(*single), wanted, bound, "m")
+    assert_near(solve(*single), wanted, bound, "m", "point")
 
 
 @invariant("gradients")

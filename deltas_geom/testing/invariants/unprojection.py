@@ -23,7 +23,7 @@ def a_pixel_with_its_depth_is_its_point(target: Target, scene: PosedScene) -> No
     """Pixels of a point, with its depth along each camera's z, give the point in every view."""
     seen = project(scene.views, scene.points)
     found = _points(target, scene.views, seen.pixels, seen.depth)
-    assert_near(found, scene.points.expand_as(found), POINT_TOLERANCE, "m")
+    assert_near(found, scene.points.expand_as(found), POINT_TOLERANCE, "m", "view point")
 
 
 @invariant("unproject")
@@ -34,7 +34,7 @@ def unprojected_points_move_with_the_world(
     depth = project(scene.views, scene.points).depth
     moved = _points(target, world.views(scene.views), scene.pixels, world.scale * depth)
     wanted = world.points(_points(target, scene.views, scene.pixels, depth))
-    assert_near(moved, wanted, POINT_TOLERANCE, "m")
+    assert_near(moved, wanted, POINT_TOLERANCE, "m", "view point")
 
 
 @invariant("unproject")
@@ -46,7 +46,9 @@ def unprojected_points_do_not_know_of_a_crop_and_a_resize(
     change = cut(scene.views, new_size=(240, 160))
     views = scene.views._replace(K=change @ scene.views.K)
     found = _points(target, views, transformed(change, scene.pixels), depth)
-    assert_near(found, _points(target, scene.views, scene.pixels, depth), POINT_TOLERANCE, "m")
+    assert_near(
+        found, _points(target, scene.views, scene.pixels, depth), POINT_TOLERANCE, "m", "view point"
+    )
 
 
 @invariant("rays")
@@ -55,7 +57,7 @@ def a_ray_is_seen_at_its_pixel(target: Target, scene: PosedScene) -> None:
     assert target.rays is not None
     rays = target.rays(scene.views.K, scene.pixels)
     found = rays @ scene.views.K.to(rays).mT
-    assert_near(found, to_homogeneous(scene.pixels), PIXEL_TOLERANCE, "px")
+    assert_near(found, to_homogeneous(scene.pixels), PIXEL_TOLERANCE, "px", "view point")
 
 
 @invariant("rays")
