@@ -1,6 +1,7 @@
 """Own matches of a capture tell what is wrong with its cameras; the cure mends it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from check_plants import MATCHES, with_depth_of_a_kinect
 from room_capture import write_scene
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.judging import judge_matches
@@ -105,6 +107,47 @@ def test_faults_planted_in_a_room_are_named_and_mended(name: str, look: Look) ->
 
 def test_depth_of_another_camera_in_a_room_is_named(look: Look, tmp_path: Path) -> None:
     assert_depth_of_a_kinect_is_named(look("room"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("layout", "cure"),
+    [
+        ("frames.json", "state a depth_scale of 1000"),
+        ("transforms_train.json", "state a depth_unit_scale_factor of 0.001"),
+        ("Polycam", "multiply the numbers of depth files by 0.2"),
+    ],
+)
+def test_steps_of_depth_are_told_in_the_words_of_the_files(
+    layout: str, cure: str, look: Look
+) -> None:
+    looked = look("room")
+    planted = replace(MATCHES["depth of 1/5000 m"][0](looked.capture), layout=layout)
+    (found,) = looked.judged(planted)
+    assert found.cause is Fault.DEPTH_SCALE and found.cure.startswith(cure)
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause", "cure"),
+    [
+        (1000, Fault.DEPTH_SCALE, "multiply the numbers of depth files by 0.001"),
+        (100, Fault.DEPTH_SCALE, "multiply the numbers of depth files by 0.01"),
+        (5, Fault.WRONG_SCALE, "or, if poses are right, depth by 0."),
+    ],
+)
+def test_a_cure_of_depth_in_floats_states_no_steps_as_none_would_count(
+    factor: float, cause: Fault, cure: str, look: Look, tmp_path: Path
+) -> None:
+    looked = look("room")
+    stored = []
+    for frame in looked.capture.frames.values():
+        np.save(tmp_path / f"{frame.id}.npy", frame.read_depth() * factor)
+        stored.append(replace(frame, depth_path=tmp_path / f"{frame.id}.npy"))
+    planted = replace(looked.capture, frames=Frames.of(stored, tmp_path))
+    (found,) = looked.judged(planted)
+    assert found.cause is cause and cure in found.cure and "1/" not in found.evidence
+    # Poses that are right are not brought to the unit of depth.
+    assert found.mend is None or looked.judged(found.mend(planted)) == []
+    assert (found.mend is None) is (cause is Fault.DEPTH_SCALE)
 
 
 @pytest.mark.parametrize("fault", ["none", "inverted", "one pose in ten"])

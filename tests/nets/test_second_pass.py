@@ -148,6 +148,25 @@ def test_measured_depth_makes_maps_better_and_alone_completes_them(
     assert errors["alone"] < 0.5 * errors["none"]
 
 
+@pytest.mark.parametrize("passes", [1, 3])
+def test_measured_depth_of_another_unit_is_doubted(
+    depth: Any, scene: Path, tmp_path: Path, passes: int
+) -> None:
+    true, file = truth_of(open_capture(scene)), tmp_path / "feet.txt"
+    places = [np.argwhere(map_ > 0)[::400] for map_ in true]
+    file.write_text(
+        "".join(
+            f"{id} {column} {row} {map_[row, column] / 0.3048:.4f}\n"
+            for id, map_, found in zip(IDS, true, places, strict=True)
+            for row, column in found
+        )
+    )
+    said = depth("feet", "--passes", passes, "--sensor-depth", file)
+    assert said.code == 0 and "times as far as what matches triangulate to" in said.err
+    said = depth("metres", "--passes", passes, "--sensor-depth", "sensor")
+    assert said.code == 0 and "times as far" not in said.err
+
+
 def test_maps_of_one_image_hear_no_others(depth: Any, scene: Path, tmp_path: Path) -> None:
     completed = ("--sensor-depth", "sensor", "--views", 1)
     assert depth("whole", *completed).code == 0
