@@ -22,7 +22,7 @@ from deltas_nets.check.units import hardly_metres
 
 __all__ = ["triangulated_depths", "wrong_scale"]
 
-UNITS = {1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
+UNITS = {1.0: "metres", 1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
 TOLERANCE = 0.12  # relative
 FAR = 300.0  # metres, where photos are usually not taken
 APART = 5.0
@@ -59,7 +59,7 @@ def wrong_scale(
         if steps is not None:
             return [_of_steps(steps, factor, len(ratios), capture.layout)]
         if unit is not None:
-            return [_of_floats(unit, factor, len(ratios))]
+            return [_of_floats(unit, factor, len(ratios), capture.layout)]
         return [_of_sensor(factor, len(ratios))]
     return (
         _without_sensor(matched.views(capture.frames), evidence, depths) if capture.metric else []
@@ -119,16 +119,29 @@ def _unit(factor: float) -> float | None:
     return next((unit for unit in UNITS if abs(np.log(factor / unit)) < TOLERANCE), None)
 
 
-def _unit_meant(capture: Capture, known: Mapping[int, Sensor], factor: float) -> float | None:
-    """The unit of floats with which poses in metres fit, in metres; None if none does."""
-    return _unit(1 / factor) if capture.metric and _holds_floats(capture, known) else None
+def _unit_meant(
+    capture: Capture, known: Mapping[int, Sensor], factor: float
+) -> tuple[float, float] | None:
+    """Metres in a unit of floats as stated, and with which poses in metres fit; None if none do."""
+    stated = {capture.frames.at(position).depth_unit for position in known}
+    if not capture.metric or len(stated) != 1 or not _holds_floats(capture, known):
+        return None
+    (unit,) = stated
+    meant = _unit(unit / factor)
+    return None if meant is None or meant == unit else (unit, meant)
 
 
-def _of_floats(unit: float, factor: float, points: int) -> Finding:
-    """Not mended, as no format can say that floats are of another unit than poses."""
-    evidence = f"{_compared(factor, points)}: depth is in {UNITS[unit]}, not in metres"
-    cure = f"multiply the numbers of depth files by {unit:g}"
-    return Finding(Fault.DEPTH_SCALE, evidence, (), cure, "error")
+def _of_floats(units: tuple[float, float], factor: float, points: int, layout: str) -> Finding:
+    stated, meant = units
+    evidence = f"{_compared(factor, points)}: depth is in {UNITS[meant]}"
+    cure = f"multiply the numbers of depth files by {meant / stated:g}"
+    if layout.startswith("transforms"):
+        cure = f"state a depth_unit_scale_factor of {meant:g}"
+
+    def change(_: int, frame: Frame) -> Frame:
+        return replace(frame, depth_unit=meant)
+
+    return Finding(Fault.DEPTH_SCALE, evidence, (), cure, "error", changing_frames(change))
 
 
 def _compared(factor: float, points: int) -> str:

@@ -14,6 +14,8 @@ from room_capture import write_scene
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
+from deltas_nets.check import scale
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.judging import judge_matches
 from deltas_nets.check.matched import Matched, match_capture
@@ -145,9 +147,27 @@ def test_a_cure_of_depth_in_floats_states_no_steps_as_none_would_count(
     planted = replace(looked.capture, frames=Frames.of(stored, tmp_path))
     (found,) = looked.judged(planted)
     assert found.cause is cause and cure in found.cure and "1/" not in found.evidence
-    # Poses that are right are not brought to the unit of depth.
-    assert found.mend is None or looked.judged(found.mend(planted)) == []
-    assert (found.mend is None) is (cause is Fault.DEPTH_SCALE)
+    assert found.mend is not None
+    mended = found.mend(planted)
+    assert looked.judged(mended) == []
+    if cause is Fault.DEPTH_SCALE:  # poses that are right are not brought to the unit of depth
+        assert np.array_equal(mended.frames.cam_from_world, planted.frames.cam_from_world)
+        save_capture(mended, tmp_path / "mended", "own")
+        assert looked.judged(open_capture(tmp_path / "mended")) == []
+
+
+def test_floats_in_metres_that_are_read_as_millimetres_are_told(look: Look) -> None:
+    looked = look("room")
+    stored = [
+        replace(frame, depth_path=Path("depth.npy"), depth_unit=0.001, depth_scale=1e6)
+        for frame in looked.capture.frames.values()
+    ]
+    planted = replace(looked.capture, frames=Frames.of(stored), layout="transforms.json")
+    known = {0: None, 1: None}
+    assert scale._unit_meant(planted, known, 0.00103) == (0.001, 1.0)  # type: ignore[arg-type]
+    found = scale._of_floats((0.001, 1.0), 0.00103, 99, planted.layout)
+    assert found.cure == "state a depth_unit_scale_factor of 1"
+    assert found.evidence.endswith("depth is in metres")
 
 
 @pytest.mark.parametrize("fault", ["none", "inverted", "one pose in ten"])
