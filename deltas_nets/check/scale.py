@@ -30,6 +30,8 @@ APART = 5.0
 SCALES = (1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Steps in a metre that depth cameras and data sets write."""
 _SAME_SCALE = 0.04  # relative
+_AS_WELL = 0.2
+"""Relative: nine in ten points of a sensor whose unit alone is wrong are so near to the median."""
 _PARALLAX = np.radians(1.0)
 _LEAST = 60  # points
 
@@ -55,6 +57,8 @@ def wrong_scale(
         factor = 1 / float(np.median(ratios))
         if abs(np.log(factor)) <= TOLERANCE:
             return []
+        if np.mean(np.abs(np.log(ratios * factor)) < _AS_WELL) < 0.5:
+            return [_of_no_factor(ratios)]
         steps, unit = _steps_meant(capture, known, factor), _unit_meant(capture, known, factor)
         if steps is not None:
             return [_of_steps(steps, factor, len(ratios), capture.layout)]
@@ -113,6 +117,17 @@ def _holds_floats(capture: Capture, known: Mapping[int, Sensor]) -> bool:
     """Whether depth is stored as floats, of which no number of steps that is stated counts."""
     files = [capture.frames.at(position).depth_path for position in known]
     return any(file is not None and file.suffix.lower() in FLOATS for file in files)
+
+
+def _of_no_factor(ratios: FloatArray) -> Finding:
+    """Depth that no unit explains: poses are not to blame, whose matches fit."""
+    low, high = np.percentile(ratios, (25, 75))
+    evidence = (
+        f"what matches triangulate to is {low:.3g} to {high:.3g} times as far as the sensor "
+        f"measured (half of {len(ratios)} points): no unit explains that"
+    )
+    cure = "see what the files hold: depth along the view, of these frames, no inverse depth"
+    return Finding(Fault.DEPTH_UNREADABLE, evidence, (), cure, "error")
 
 
 def _unit(factor: float) -> float | None:

@@ -156,6 +156,20 @@ def test_a_cure_of_depth_in_floats_states_no_steps_as_none_would_count(
         assert looked.judged(open_capture(tmp_path / "mended")) == []
 
 
+def test_inverse_depth_is_no_reason_to_scale_poses(look: Look, tmp_path: Path) -> None:
+    looked = look("room")
+    stored = []
+    for frame in looked.capture.frames.values():
+        depth = frame.read_depth()
+        inverse = np.divide(10, depth, out=np.zeros_like(depth), where=depth > 0)
+        np.save(tmp_path / f"{frame.id}.npy", inverse)
+        stored.append(replace(frame, depth_path=tmp_path / f"{frame.id}.npy"))
+    planted = replace(looked.capture, frames=Frames.of(stored, tmp_path))
+    (found,) = looked.judged(planted)
+    assert found.cause is Fault.DEPTH_UNREADABLE and found.mend is None
+    assert "no unit explains" in found.evidence and "inverse depth" in found.cure
+
+
 def test_floats_in_metres_that_are_read_as_millimetres_are_told(look: Look) -> None:
     looked = look("room")
     stored = [
