@@ -175,6 +175,7 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.predict.search import Asked, Completed, Followed
 
         measured = self.measured(capture)
+        self.check_whole(capture, anchors)
         if self.views == 1:
             assert measured is not None  # or the flag would have been refused
             self.check_completes(measured, capture, anchors)

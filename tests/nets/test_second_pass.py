@@ -167,6 +167,18 @@ def test_measured_depth_of_another_unit_is_doubted(
     assert said.code == 0 and "times as far" not in said.err
 
 
+def test_measured_depth_that_is_damaged_is_named_before_anything_is_written(
+    depth: Any, scene: Path, tmp_path: Path
+) -> None:
+    damaged = scene / "depth" / f"{IDS[-1]}.png"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:200])
+    said = depth("damaged", "--sensor-depth", "sensor")
+    damaged.write_bytes(whole)
+    assert_one_line(said, str(damaged))
+    assert not (tmp_path / "damaged").exists()
+
+
 def test_maps_of_one_image_hear_no_others(depth: Any, scene: Path, tmp_path: Path) -> None:
     completed = ("--sensor-depth", "sensor", "--views", 1)
     assert depth("whole", *completed).code == 0
