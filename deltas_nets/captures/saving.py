@@ -44,6 +44,18 @@ def doubts_of_images(capture: Capture) -> list[str]:
     return [f"{count} cannot be used ({ids_in_words(broken)}): {first}"]
 
 
+def _refused(error: OSError, out: Path) -> UserError:
+    """What to tell where the system refuses to read a file or to write the folder.
+
+    Where one could not become the other both are named, and it is the new one that is to blame.
+    """
+    why, source = error.strerror or error, error.filename
+    if source is not None and error.filename2 is None and Path(source).is_file():
+        return UserError(f"the file cannot be read ({why})", Path(source), "make it readable")
+    what = f"the capture cannot be written ({why})"
+    return UserError(what, out, "name a place that can be written and has space")
+
+
 def save_capture(
     capture: Capture,
     out: str | Path,
@@ -91,10 +103,6 @@ def save_capture(
             with contextlib.suppress(OSError):
                 folder.rmdir()
         if isinstance(error, OSError):
-            what = f"the capture cannot be written ({error.strerror or error})"
-            where = Path(error.filename or out)
-            raise UserError(
-                what, where, "name a place that can be written and has space"
-            ) from error
+            raise _refused(error, out) from error
         raise
     return said

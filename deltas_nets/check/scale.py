@@ -11,6 +11,7 @@ from deltas_geom import PosedViews, triangulate
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.diagnosis.evidence import Evidence
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.depth_files import FLOATS
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.matched import Matched
@@ -21,7 +22,7 @@ from deltas_nets.check.units import hardly_metres
 
 __all__ = ["triangulated_depths", "wrong_scale"]
 
-UNITS = {1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
+UNITS = {1.0: "metres", 1e-3: "millimetres", 0.01: "centimetres", 0.3048: "feet", 0.0254: "inches"}
 TOLERANCE = 0.12  # relative
 FAR = 300.0  # metres, where photos are usually not taken
 APART = 5.0
@@ -29,6 +30,8 @@ APART = 5.0
 SCALES = (1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Steps in a metre that depth cameras and data sets write."""
 _SAME_SCALE = 0.04  # relative
+_AS_WELL = 0.2
+"""Relative: nine in ten points of a sensor whose unit alone is wrong are so near to the median."""
 _PARALLAX = np.radians(1.0)
 _LEAST = 60  # points
 
@@ -54,9 +57,13 @@ def wrong_scale(
         factor = 1 / float(np.median(ratios))
         if abs(np.log(factor)) <= TOLERANCE:
             return []
-        steps = _steps_meant(capture, known, factor)
+        if np.mean(np.abs(np.log(ratios * factor)) < _AS_WELL) < 0.5:
+            return [_of_no_factor(ratios)]
+        steps, unit = _steps_meant(capture, known, factor), _unit_meant(capture, known, factor)
         if steps is not None:
-            return [_of_steps(steps, factor, len(ratios))]
+            return [_of_steps(steps, factor, len(ratios), capture.layout)]
+        if unit is not None:
+            return [_of_floats(unit, factor, len(ratios), capture.layout)]
         return [_of_sensor(factor, len(ratios))]
     return (
         _without_sensor(matched.views(capture.frames), evidence, depths) if capture.metric else []
@@ -106,12 +113,65 @@ def _read(sensor: Sensor, pixels: FloatArray, size: tuple[int, int]) -> FloatArr
     return np.where(inside, depth, 0.0).astype(np.float64)
 
 
+def _holds_floats(capture: Capture, known: Mapping[int, Sensor]) -> bool:
+    """Whether depth is stored as floats, of which no number of steps that is stated counts."""
+    files = [capture.frames.at(position).depth_path for position in known]
+    return any(file is not None and file.suffix.lower() in FLOATS for file in files)
+
+
+def _of_no_factor(ratios: FloatArray) -> Finding:
+    """Depth that no unit explains: poses are not to blame, whose matches fit."""
+    low, high = np.percentile(ratios, (25, 75))
+    evidence = (
+        f"what matches triangulate to is {low:.3g} to {high:.3g} times as far as the sensor "
+        f"measured (half of {len(ratios)} points): no unit explains that"
+    )
+    cure = "see what the files hold: depth along the view, of these frames, no inverse depth"
+    return Finding(Fault.DEPTH_UNREADABLE, evidence, (), cure, "error")
+
+
+def _unit(factor: float) -> float | None:
+    return next((unit for unit in UNITS if abs(np.log(factor / unit)) < TOLERANCE), None)
+
+
+def _unit_meant(
+    capture: Capture, known: Mapping[int, Sensor], factor: float
+) -> tuple[float, float] | None:
+    """Metres in a unit of floats as stated, and with which poses in metres fit; None if none do."""
+    stated = {capture.frames.at(position).depth_unit for position in known}
+    if not capture.metric or len(stated) != 1 or not _holds_floats(capture, known):
+        return None
+    (unit,) = stated
+    meant = _unit(unit / factor)
+    return None if meant is None or meant == unit else (unit, meant)
+
+
+def _of_floats(units: tuple[float, float], factor: float, points: int, layout: str) -> Finding:
+    stated, meant = units
+    evidence = f"{_compared(factor, points)}: depth is in {UNITS[meant]}"
+    cure = f"multiply the numbers of depth files by {meant / stated:g}"
+    if layout.startswith("transforms"):
+        cure = f"state a depth_unit_scale_factor of {meant:g}"
+
+    def change(_: int, frame: Frame) -> Frame:
+        return replace(frame, depth_unit=meant)
+
+    return Finding(Fault.DEPTH_SCALE, evidence, (), cure, "error", changing_frames(change))
+
+
+def _compared(factor: float, points: int) -> str:
+    return (
+        f"what matches triangulate to is {1 / factor:.4g} times as far as the sensor measured "
+        f"(median of {points} points)"
+    )
+
+
 def _steps_meant(
     capture: Capture, known: Mapping[int, Sensor], factor: float
 ) -> tuple[float, float] | None:
     """Steps in a metre as stated, and those with which poses in metres fit; None if none do."""
     stated = {capture.frames.at(position).depth_scale for position in known}
-    if not capture.metric or len(stated) != 1:
+    if not capture.metric or len(stated) != 1 or _holds_floats(capture, known):
         return None
     (scale,) = stated
     meant = scale * factor
@@ -119,26 +179,30 @@ def _steps_meant(
     return None if near is None else (scale, near)
 
 
-def _of_steps(steps: tuple[float, float], factor: float, points: int) -> Finding:
+def _of_steps(steps: tuple[float, float], factor: float, points: int, layout: str) -> Finding:
     stated, meant = steps
-    evidence = (
-        f"what matches triangulate to is {1 / factor:.4g} times as far as the sensor measured "
-        f"(median of {points} points): depth is in 1/{meant:g} m, not in 1/{stated:g} m"
-    )
+    evidence = f"{_compared(factor, points)}: depth is in 1/{meant:g} m, not in 1/{stated:g} m"
 
     def change(_: int, frame: Frame) -> Frame:
         return replace(frame, depth_scale=meant)
 
-    cure = f"state a depth_scale of {meant:g}"
+    cure = _cure_of_steps(stated, meant, layout)
     return Finding(Fault.DEPTH_SCALE, evidence, (), cure, "error", changing_frames(change))
 
 
+def _cure_of_steps(stated: float, meant: float, layout: str) -> str:
+    """In the words of the files, if their format has any; most have one number of steps."""
+    if layout.startswith("frames."):
+        return f"state a depth_scale of {meant:g}"
+    if layout.startswith("transforms"):
+        said = f"state a depth_unit_scale_factor of {1 / meant:g}"
+        return f"{said} (integer_depth_scale, if frames have depth_path)"
+    return f"multiply the numbers of depth files by {stated / meant:g}"
+
+
 def _of_sensor(factor: float, points: int) -> Finding:
-    unit = next((u for u in UNITS if abs(np.log(factor / u)) < TOLERANCE), None)
-    evidence = (
-        f"what matches triangulate to is {1 / factor:.4g} times as far as the sensor measured "
-        f"(median of {points} points)"
-    )
+    unit = _unit(factor)
+    evidence = _compared(factor, points)
     if unit is not None:
         evidence += f": poses are in {UNITS[unit]}"
         factor = unit

@@ -183,6 +183,7 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.predict.search import Asked, Completed, Followed
 
         measured = self.measured(capture)
+        self.check_whole(capture, anchors)
         if self.views == 1:
             assert measured is not None  # or the flag would have been refused
             self.check_completes(measured, capture, anchors)
@@ -244,10 +245,11 @@ class Depth(Captured, Measuring, Prediction):
     ) -> "OutputFolder":
         import torch
 
+        from deltas_nets.captures.camera_sums import camera_sums
         from deltas_nets.captures.ids import id_in_json
         from deltas_nets.outputs.depth_formats import MILLIMETRES
         from deltas_nets.outputs.prepare import prepare_output
-        from deltas_nets.outputs.summary import FORMAT, SCALE, view_sets_in_json
+        from deltas_nets.outputs.summary import CAMERA_SUMS, FORMAT, SCALE, view_sets_in_json
 
         predict = to_dict(config)
         if self.depth_range is None:
@@ -279,6 +281,7 @@ class Depth(Captured, Measuring, Prediction):
                 "unit": options.unit,
                 "scaled_by": capture.scaled_by,
                 "depth_scaled_by": capture.depth_scaled_by,
+                CAMERA_SUMS: camera_sums(capture.frames),
                 "lost_poses": list(map(id_in_json, capture.lost)),
                 "sets_short_of_views": views.short,
             },

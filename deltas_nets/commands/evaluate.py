@@ -240,7 +240,8 @@ class Evaluate(Prediction):
         if len(scores.scenes) + len(scores.failed) > 1:
             console.print(report.scenes_table(scores, title="scenes, means over frames"))
         title = f"{title}: {len(total.frames)} frames"
-        console.print(report.metrics_table(report.scores_by_name(total), title=title))
+        columns = report.scores_by_name(total)
+        console.print(report.metrics_table(columns, title=title, metric=total.metric))
         if total.sparse is not None and math.isnan(total.sparse.abs_rel):
             print(
                 "no triangulated point lies where depth is measured: are poses and depth in the "

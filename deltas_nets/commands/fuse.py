@@ -88,7 +88,7 @@ class Fuse(Command):
         unused = {"min_confidence": sensor, "neighbours": alone, "least": alone}
         refuse_unused(self, unused)
         capture = opened(self.capture, self.intrinsics)
-        # Maps know theirs, to the last digit, as their cameras are known by a hash.
+        # Maps know theirs, to the last digit, as their cameras are known.
         if self.scale is not None and self._of_sensor:
             capture = in_metres(capture, self.scale)
         self.fuse(capture, out)

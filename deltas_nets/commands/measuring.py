@@ -81,6 +81,18 @@ class Measuring:
             remedy = "name the others with --view-sets, or use --views 2 or more"
             raise UserError(what, "--sensor-depth", remedy)
 
+    def check_whole(self, capture: "Capture", anchors: list[str]) -> None:
+        """Whether the depth images that will be read are whole, before anything is written.
+
+        Raises:
+            UserError: names the first that is not.
+        """
+        if str(self.sensor_depth) != "sensor":
+            return
+        for frame in map(capture.frame, anchors):
+            if frame.depth_path is not None:
+                frame.check_depth()
+
     def measured_record(self) -> dict[str, Any]:
         """What the results depend on, for the record of a run; nothing where nothing is asked."""
         if self.sensor_depth is None:

@@ -185,6 +185,7 @@ def _evaluate(
         None if own.empty else own.result(),
         failed={id: str(error) for id, error in failed.items()},
         consistency=seen.result() if scoring.consistency else None,
+        metric=capture.metric,
     )
 
 

@@ -103,6 +103,7 @@ def _total(scenes: Mapping[str, CaptureScores], meter: CalibrationMeter) -> Capt
         }
 
     calibration = None if meter.empty else meter.result()
-    total = mean_scores(all_of("maps"), calibration, failed=all_of("failed"))
+    metric = all(scores.metric for scores in scenes.values())
+    total = mean_scores(all_of("maps"), calibration, failed=all_of("failed"), metric=metric)
     without = [f"{name}/{id}" for name, s in scenes.items() for id in s.without_truth]
     return total._replace(without_truth=tuple(without))

@@ -14,9 +14,9 @@ from deltas_nets.evaluate.scores import CaptureScores
 
 NAMES = {
     "abs_rel": "Abs Rel",
-    "abs_diff": "Abs, m",
-    "sq_rel": "Sq Rel, m",
-    "rmse": "RMSE, m",
+    "abs_diff": "Abs",
+    "sq_rel": "Sq Rel",
+    "rmse": "RMSE",
     "rmse_log": "RMSE log",
     "delta1": "delta < 1.25",
     "delta2": "delta < 1.25^2",
@@ -25,15 +25,18 @@ NAMES = {
     "delta103": "delta < 1.03",
     "coverage": "coverage",
 }
+LENGTHS = ("abs_diff", "sq_rel", "rmse")
+"""Metrics with a unit, which is the metre where captures know it."""
 
 
-def metrics_table(columns: Mapping[str, DepthMetrics], *, title: str) -> Table:
+def metrics_table(columns: Mapping[str, DepthMetrics], *, title: str, metric: bool = True) -> Table:
     """The paper's metrics, a column for each name: it fits any terminal."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("", no_wrap=True)
     for name in columns:
         table.add_column("\n".join(name.rsplit(" ", 1)), justify="right")
     for key, label in NAMES.items():
+        label += _unit(metric) if key in LENGTHS else ""
         table.add_row(label, *(_number(getattr(metrics, key)) for metrics in columns.values()))
     return table
 
@@ -42,7 +45,8 @@ def scenes_table(scores: DatasetScores, *, title: str) -> Table:
     """A row a scene, and one of all: frames, those that failed, and the metrics most looked at."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("scene", overflow="fold")
-    for name in ("frames", "failed", "Abs Rel", "Abs, m", "delta\n< 1.25", "coverage"):
+    metric = scores.total.metric
+    for name in ("frames", "failed", "Abs Rel", f"Abs{_unit(metric)}", "delta\n< 1.25", "coverage"):
         table.add_column(name, justify="right")
     for name, scene in {**scores.scenes, "all": scores.total}.items():
         shown = ("abs_rel", "abs_diff", "delta1", "coverage")
@@ -98,6 +102,10 @@ def scores_by_name(scores: CaptureScores) -> dict[str, DepthMetrics]:
         "scale and shift": scores.fitted,
     }
     return rows if scores.sparse is None else rows | {"sparse points": scores.sparse}
+
+
+def _unit(metric: bool) -> str:
+    return ", m" if metric else ", units"
 
 
 def _number(value: float | None, digits: int = 3) -> str:

@@ -144,6 +144,8 @@ def scores_as_json(scores: CaptureScores) -> dict[str, Any]:
     """Everything in a capture's scores, JSON-ready."""
     rows = {name: metrics._asdict() for name, metrics in scores_by_name(scores).items()}
     written: dict[str, Any] = {"metrics": rows, "abs_rel_by_frame": scores.frames}
+    if not scores.metric:
+        written["unit"] = "the capture's own"
     if scores.ause is not None:
         written["ause"] = scores.ause
     if scores.calibration is not None:

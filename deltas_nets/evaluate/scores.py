@@ -48,6 +48,7 @@ class CaptureScores(NamedTuple):
         without_truth: ids of frames without true depth in range.
         failed: why there is no map, by the ids of the frames that failed.
         consistency: of the maps with each other, if it was asked for.
+        metric: whether lengths are in metres; if not, in the unit of their capture.
     """
 
     dense: DepthMetrics
@@ -62,6 +63,7 @@ class CaptureScores(NamedTuple):
     without_truth: tuple[str, ...]
     failed: dict[str, str]
     consistency: Consistency | None
+    metric: bool
 
 
 def score_map(
@@ -105,6 +107,7 @@ def mean_scores(
     *,
     failed: Mapping[str, str] | None = None,
     consistency: Consistency | None = None,
+    metric: bool = True,
 ) -> CaptureScores:
     """Means over the maps that have true depth in range.
 
@@ -113,6 +116,7 @@ def mean_scores(
         calibration: of all maps.
         failed: why there is no map of other frames.
         consistency: of all maps.
+        metric: whether all of them are in metres.
 
     Raises:
         ValueError: none has.
@@ -134,6 +138,7 @@ def mean_scores(
         without_truth=tuple(id for id, score in scores.items() if score is None),
         failed=dict(failed or {}),
         consistency=consistency,
+        metric=metric,
     )
 
 

@@ -50,8 +50,9 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     or the new one.
 
     Raises:
-        UserError: the system refuses; nothing is left behind then.
+        UserError: the system refuses, or a device or a pipe is there; nothing is left behind then.
     """
+    _check_no_device(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.deltas-tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,11 +118,20 @@ def check_file(file: Path, *, remedy: str = "name a file") -> None:
     """Whether a file can be written, before the work whose results it is for.
 
     Raises:
-        UserError: it is a folder, or the system refuses.
+        UserError: it is a folder, a device or a pipe, or the system refuses.
     """
     if file.is_dir():
         raise UserError("this is a folder, not a file", file, remedy)
+    _check_no_device(file)
     check_writable(file.parent)
+
+
+def _check_no_device(path: Path) -> None:
+    """Refuse what a rename would replace for every program, as root /dev/null or /dev/stdout."""
+    to_a_process = path.is_symlink() and os.readlink(path).startswith("/proc/")
+    if to_a_process or (path.exists() and not path.is_file() and not path.is_dir()):
+        what = "this is a device or a pipe, which cannot be replaced"
+        raise UserError(what, path, "name a file")
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

@@ -18,6 +18,8 @@ SCALE = "depth_scale"
 """The setting that is there where a unit has not 1000 steps of a depth image."""
 FORMAT = "format"
 """The setting that is there where depth maps are no PNG."""
+CAMERA_SUMS = "camera_sums"
+"""What tells the cameras of the run from others where rounding alone differs."""
 SHARD_SUMMARY = re.compile(r"summary\.\d+-of-\d+\.json")
 
 

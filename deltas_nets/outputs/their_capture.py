@@ -4,12 +4,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from deltas_nets.captures.camera_sums import are_sums_of
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.scaled import scaled
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.depth_formats import DEPTH_FORMATS
-from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_view_sets
+from deltas_nets.outputs.summary import (
+    CAMERA_SUMS,
+    SUMMARY,
+    read_summary,
+    recorded_view_sets,
+)
 
 __all__ = ["METRE", "MadeOf", "in_their_unit", "made_of", "map_file"]
 
@@ -87,7 +93,9 @@ def _as_recorded(capture: Capture, folder: Path, summary: Mapping[str, Any]) -> 
     capture = _scaled_as_recorded(capture, summary)
     recorded = summary["settings"].get("capture")
     cameras = recorded.get("cameras") if isinstance(recorded, dict) else None
-    if cameras is not None and cameras != capture.fingerprint():
+    same = cameras is None or cameras == capture.fingerprint()
+    # The capture in another format is the same, too: its numbers are rounded otherwise.
+    if not same and not are_sums_of(summary.get(CAMERA_SUMS), capture.frames):
         raise UserError(
             "the maps are of other cameras than the capture has",
             folder / SUMMARY,

@@ -131,7 +131,10 @@ def _verdict(maps: Maps) -> dict[str, Any]:
 
 def _numbers(record: Mapping[str, Any]) -> dict[str, float]:
     """What a verdict reads, of a summary that may be of another version."""
-    names = ("confidence", "network_confidence", "valid_points", "keypoints", "seconds")
+    names = (
+        *("confidence", "network_confidence", "valid_points", "keypoints", "seconds"),
+        "measured_factor",
+    )
     found = {name: record[name] for name in names if isinstance(record.get(name), int | float)}
     if "valid_points" not in found:
         found.pop("keypoints", None)

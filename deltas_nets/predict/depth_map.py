@@ -107,6 +107,8 @@ class DepthMap(NamedTuple):
             that the network works at; None where the network states none.
         work: ``(1, h, w)`` what the network says, at that size and of the straight image where
             a lens bends lines, in the capture's unit; None where it states no deviation.
+        measured_factor: how many times as far as the triangulated points measured depth says that
+            things are; None where nothing was measured, or nothing triangulated.
     """
 
     depth: NDArray[np.float32]
@@ -116,6 +118,7 @@ class DepthMap(NamedTuple):
     keypoints: KeypointDepths
     log_std: torch.Tensor | None = None
     work: KnownDepth | None = None
+    measured_factor: float | None = None
 
 
 def finished_map(

@@ -17,6 +17,7 @@ from deltas_nets.captures.straight import (
     straight,
 )
 from deltas_nets.predict.depth_map import DepthMap, PredictConfig, Wanted, resized
+from deltas_nets.predict.measured_factor import measured_factor
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
 
@@ -50,6 +51,9 @@ def look(
         measured = measured._replace(depth=measured.depth * unit)
     of_straight = replace(config, size=None) if isinstance(anchor, StraightFrame) else config
     found = predictor.depth_map(Wanted(seen, of_straight, measured))
+    if measured is not None and others:
+        factor = measured_factor(found.keypoints, measured, anchor.image_size)
+        found = found._replace(measured_factor=factor)
     found = found if unit == 1 else _in_units_of_capture(found, unit)
     return as_photographed(found, anchor, config)
 

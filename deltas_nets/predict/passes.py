@@ -153,6 +153,8 @@ class Passes:
             del record["keypoints"]  # nothing was triangulated: what is measured was completed
         if found.piled is not None:
             record["points_pile_up"] = found.piled
+        if result.measured_factor is not None:
+            record["measured_factor"] = float(f"{result.measured_factor:.4g}")
         return found, record
 
     def _written(self, views: ViewSet, found: DepthMap, record: Record) -> Record:

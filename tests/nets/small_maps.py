@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from deltas_nets.captures.camera_sums import camera_sums
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.outputs.products import FrameOutput, OutputOptions
+from deltas_nets.outputs.summary import CAMERA_SUMS
 from deltas_nets.page.scene import camera_of
 from deltas_nets.page.surfaces import Surface
 
@@ -44,6 +46,7 @@ def write_maps(
             "unit": options.unit,
             "scaled_by": capture.scaled_by,
             "depth_scaled_by": capture.depth_scaled_by,
+            CAMERA_SUMS: camera_sums(capture.frames),
         },
     )
     for id in ids:

@@ -1,6 +1,7 @@
 """Own matches of a capture tell what is wrong with its cameras; the cure mends it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,10 @@ from check_plants import MATCHES, with_depth_of_a_kinect
 from room_capture import write_scene
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
+from deltas_nets.check import scale
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.judging import judge_matches
 from deltas_nets.check.matched import Matched, match_capture
@@ -105,6 +109,79 @@ def test_faults_planted_in_a_room_are_named_and_mended(name: str, look: Look) ->
 
 def test_depth_of_another_camera_in_a_room_is_named(look: Look, tmp_path: Path) -> None:
     assert_depth_of_a_kinect_is_named(look("room"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("layout", "cure"),
+    [
+        ("frames.json", "state a depth_scale of 1000"),
+        ("transforms_train.json", "state a depth_unit_scale_factor of 0.001"),
+        ("Polycam", "multiply the numbers of depth files by 0.2"),
+    ],
+)
+def test_steps_of_depth_are_told_in_the_words_of_the_files(
+    layout: str, cure: str, look: Look
+) -> None:
+    looked = look("room")
+    planted = replace(MATCHES["depth of 1/5000 m"][0](looked.capture), layout=layout)
+    (found,) = looked.judged(planted)
+    assert found.cause is Fault.DEPTH_SCALE and found.cure.startswith(cure)
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause", "cure"),
+    [
+        (1000, Fault.DEPTH_SCALE, "multiply the numbers of depth files by 0.001"),
+        (100, Fault.DEPTH_SCALE, "multiply the numbers of depth files by 0.01"),
+        (5, Fault.WRONG_SCALE, "or, if poses are right, depth by 0."),
+    ],
+)
+def test_a_cure_of_depth_in_floats_states_no_steps_as_none_would_count(
+    factor: float, cause: Fault, cure: str, look: Look, tmp_path: Path
+) -> None:
+    looked = look("room")
+    stored = []
+    for frame in looked.capture.frames.values():
+        np.save(tmp_path / f"{frame.id}.npy", frame.read_depth() * factor)
+        stored.append(replace(frame, depth_path=tmp_path / f"{frame.id}.npy"))
+    planted = replace(looked.capture, frames=Frames.of(stored, tmp_path))
+    (found,) = looked.judged(planted)
+    assert found.cause is cause and cure in found.cure and "1/" not in found.evidence
+    assert found.mend is not None
+    mended = found.mend(planted)
+    assert looked.judged(mended) == []
+    if cause is Fault.DEPTH_SCALE:  # poses that are right are not brought to the unit of depth
+        assert np.array_equal(mended.frames.cam_from_world, planted.frames.cam_from_world)
+        save_capture(mended, tmp_path / "mended", "own")
+        assert looked.judged(open_capture(tmp_path / "mended")) == []
+
+
+def test_inverse_depth_is_no_reason_to_scale_poses(look: Look, tmp_path: Path) -> None:
+    looked = look("room")
+    stored = []
+    for frame in looked.capture.frames.values():
+        depth = frame.read_depth()
+        inverse = np.divide(10, depth, out=np.zeros_like(depth), where=depth > 0)
+        np.save(tmp_path / f"{frame.id}.npy", inverse)
+        stored.append(replace(frame, depth_path=tmp_path / f"{frame.id}.npy"))
+    planted = replace(looked.capture, frames=Frames.of(stored, tmp_path))
+    (found,) = looked.judged(planted)
+    assert found.cause is Fault.DEPTH_UNREADABLE and found.mend is None
+    assert "no unit explains" in found.evidence and "inverse depth" in found.cure
+
+
+def test_floats_in_metres_that_are_read_as_millimetres_are_told(look: Look) -> None:
+    looked = look("room")
+    stored = [
+        replace(frame, depth_path=Path("depth.npy"), depth_unit=0.001, depth_scale=1e6)
+        for frame in looked.capture.frames.values()
+    ]
+    planted = replace(looked.capture, frames=Frames.of(stored), layout="transforms.json")
+    known = {0: None, 1: None}
+    assert scale._unit_meant(planted, known, 0.00103) == (0.001, 1.0)  # type: ignore[arg-type]
+    found = scale._of_floats((0.001, 1.0), 0.00103, 99, planted.layout)
+    assert found.cure == "state a depth_unit_scale_factor of 1"
+    assert found.evidence.endswith("depth is in metres")
 
 
 @pytest.mark.parametrize("fault", ["none", "inverted", "one pose in ten"])

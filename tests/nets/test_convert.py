@@ -1,6 +1,7 @@
 """What is written in a format is what is read from it."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -229,3 +230,21 @@ def test_a_sensor_is_no_folder_of_maps(make_capture: MakeCapture, tmp_path: Path
     given = ("convert", make_capture(), tmp_path / "out", "--to", "own", "--depths", "sensor")
     assert_one_line(run(*given), "--depths sensor")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_what_is_to_blame_for_a_copy_that_fails_is_named(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: bool
+) -> None:
+    def fail(source: Path, target: Path) -> None:
+        if full:
+            raise OSError(28, "No space left on device", str(source), None, str(target))
+        raise PermissionError(13, "Permission denied", str(source))
+
+    monkeypatch.setattr(shutil, "copyfile", fail)
+    with pytest.raises(UserError) as raised:
+        save_capture(capture, tmp_path / "out")
+    said, image = raised.value, capture.frames.at(0).image_path
+    assert said.where == (tmp_path / "out" if full else image)
+    assert ("cannot be written" if full else "cannot be read") in said.what
+    assert list(tmp_path.glob("*out*")) == []

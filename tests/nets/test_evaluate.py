@@ -347,3 +347,10 @@ def test_depth_in_another_unit_is_told_from_none(run: Run, tmp_path: Path) -> No
     assert "--depth-range NEAR FAR in the capture's own unit" in result.err
     result = run(*command, "--depth-range", 500, 10000)
     assert result.code == 0 and "in its own unit, not in metres" in result.err
+    for label in ("Abs, units", "Sq Rel, units", "RMSE, units"):
+        assert label in result.out
+    assert ", m " not in result.out
+    several = ("evaluate", tmp_path / "walk", tmp_path / "millimetres", *command[2:])
+    result = run(*several, "--depth-range", 0.5, 10000)
+    assert result.code == 0 and "Abs, units" in result.out
+    assert "Abs, m " in run("evaluate", tmp_path / "walk", *command[2:]).out

@@ -1,5 +1,6 @@
 """Every file that a command is to write is looked at before the work that it is for."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 from run_command import Run, assert_one_line
 
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.atomic_files import check_file
+from deltas_nets.outputs.atomic_files import check_file, write_json
 
 COMMANDS = (
     "evaluate --rooms 1 --json",
@@ -52,3 +53,16 @@ def test_what_can_be_written_is_left_as_it_is(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["old"]
     with pytest.raises(UserError, match=r"folder, not a file.*: name it"):
         check_file(tmp_path, remedy="name it")
+
+
+def test_devices_and_pipes_are_not_replaced(tmp_path: Path) -> None:
+    pipe, link, out = tmp_path / "pipe", tmp_path / "link", tmp_path / "stdout"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    out.symlink_to("/proc/self/fd/1")  # what /dev/stdout is, wherever that leads
+    before = {path: path.lstat().st_ino for path in (pipe, link, out)}
+    for path in before:
+        for write in (check_file, lambda path: write_json(path, {})):
+            with pytest.raises(UserError, match="a device or a pipe"):
+                write(path)
+    assert {path: path.lstat().st_ino for path in tmp_path.iterdir()} == before

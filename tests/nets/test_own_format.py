@@ -144,6 +144,16 @@ def test_depth_points_and_who_sees_them(tmp_path: Path) -> None:
     assert seen.pixels.tolist() == [[3, 2], [0, 0]]
 
 
+@pytest.mark.parametrize("key", ["quaternion", "rotation", "R", "t", "position", "qw"])
+def test_a_part_of_a_pose_is_told_to_be_of_a_matrix(tmp_path: Path, key: str) -> None:
+    for frames in (changed(**{key: [1, 0, 0, 0]}), [{**FRAMES[0], key: 1}, FRAMES[1]]):
+        with pytest.raises(UserError, match="unknown key") as error:
+            open_capture(write(tmp_path, frames))
+        assert "world_from_cam, a 4x4" in error.value.remedy
+    with pytest.raises(UserError, match="has more than 240 bytes"):
+        open_capture(write(tmp_path, changed(id="é" * 121)))
+
+
 @pytest.mark.parametrize(
     ("key", "meant"),
     [

@@ -237,6 +237,11 @@ def test_the_verdict_and_the_scores_say_what_they_rest_on(filled: tuple[Path, Pa
     data = data_of(folder)
     assert data["verdict"]["line"].startswith("mean confidence 0.20")
     assert len(data["notes"]) == 1 and "they are scored against" in data["notes"][0]
+    for record in summary["frames"].values():
+        record["measured_factor"] = 5.04
+    file.write_text(json.dumps(summary))
+    page_of(capture, folder)
+    assert "5.04 times as far" in data_of(folder)["verdict"]["line"]
 
 
 # What is wrong

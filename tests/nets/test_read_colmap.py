@@ -253,13 +253,20 @@ def test_resized_images_have_scaled_intrinsics_and_pixels(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("size", [(6, 8), (8, 8)])
-def test_images_of_another_shape_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_images_of_another_shape_are_refused(
+    tmp_path: Path, size: tuple[int, int], orientation: int
+) -> None:
     folder = write_model(tmp_path)
-    Image.new("RGB", size).save(folder / "images" / "a.png")
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.new("RGB", size).save(folder / "images" / "a.png", exif=exif)
     with pytest.raises(UserError) as error:
         open_capture(folder)
     assert error.value.where == folder / "images" / "a.png"
-    assert ("EXIF" in error.value.remedy) == (size == (6, 8))
+    # It is blamed where it turns the file on its side, and nowhere else.
+    assert ("EXIF" in error.value.remedy) == (size == (6, 8) and orientation > 4)
+    assert ("rotate the images back" in error.value.remedy) == (size == (6, 8) and orientation < 5)
 
 
 def test_lines_of_images_without_pixels_may_be_left_out(tmp_path: Path) -> None:

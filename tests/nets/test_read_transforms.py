@@ -17,6 +17,7 @@ from deltas_geom import PosedViews
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Lens
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.saving import save_capture
 from deltas_nets.errors import UserError
 
 EYE = np.eye(4).tolist()
@@ -204,6 +205,22 @@ def test_depth_its_unit_and_what_it_says_of_the_world(tmp_path: Path) -> None:
     assert capture.metric and the_frame(capture).read_depth()[0, 0] == pytest.approx(0.25)
     capture = open_capture(write(tmp_path, depth, depth_unit_scale_factor=0.01))
     assert the_frame(capture).read_depth()[0, 0] == pytest.approx(2.5)
+    np.save(tmp_path / "depth" / "b.npy", np.full((6, 8), 250.5, np.float32))
+    floats = {"depth_file_path": "depth/b.npy"}  # which nerfstudio multiplies, too
+    for root, metres in (({}, 0.2505), ({"depth_unit_scale_factor": 1}, 250.5)):
+        capture = open_capture(write(tmp_path, floats, **root))
+        assert the_frame(capture).read_depth()[0, 0] == pytest.approx(metres)
+        for format in ("own", "transforms"):
+            saved = tmp_path / f"{format}-{metres}"
+            save_capture(capture, saved, format)
+            found = the_frame(open_capture(saved))
+            assert found.read_depth()[0, 0] == pytest.approx(metres)
+            assert found.depth_path is not None and found.depth_path.suffix == ".npy"
+    both = [_frame("a") | depth, _frame("b") | floats]
+    save_capture(open_capture(write(tmp_path, *both)), tmp_path / "both", "transforms")
+    first, second = open_capture(tmp_path / "both").frames.values()
+    assert first.read_depth()[0, 0] == pytest.approx(0.25)
+    assert second.read_depth()[0, 0] == pytest.approx(0.2505, abs=6e-4)
     assert not open_capture(write(tmp_path)).metric
     gone = [_frame("a") | depth, _frame("b") | {"depth_file_path": "gone/b.png"}]
     capture = open_capture(write(tmp_path, *gone))

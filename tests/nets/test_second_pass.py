@@ -148,6 +148,37 @@ def test_measured_depth_makes_maps_better_and_alone_completes_them(
     assert errors["alone"] < 0.5 * errors["none"]
 
 
+@pytest.mark.parametrize("passes", [1, 3])
+def test_measured_depth_of_another_unit_is_doubted(
+    depth: Any, scene: Path, tmp_path: Path, passes: int
+) -> None:
+    true, file = truth_of(open_capture(scene)), tmp_path / "feet.txt"
+    places = [np.argwhere(map_ > 0)[::400] for map_ in true]
+    file.write_text(
+        "".join(
+            f"{id} {column} {row} {map_[row, column] / 0.3048:.4f}\n"
+            for id, map_, found in zip(IDS, true, places, strict=True)
+            for row, column in found
+        )
+    )
+    said = depth("feet", "--passes", passes, "--sensor-depth", file)
+    assert said.code == 0 and "times as far as what matches triangulate to" in said.err
+    said = depth("metres", "--passes", passes, "--sensor-depth", "sensor")
+    assert said.code == 0 and "times as far" not in said.err
+
+
+def test_measured_depth_that_is_damaged_is_named_before_anything_is_written(
+    depth: Any, scene: Path, tmp_path: Path
+) -> None:
+    damaged = scene / "depth" / f"{IDS[-1]}.png"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:200])
+    said = depth("damaged", "--sensor-depth", "sensor")
+    damaged.write_bytes(whole)
+    assert_one_line(said, str(damaged))
+    assert not (tmp_path / "damaged").exists()
+
+
 def test_maps_of_one_image_hear_no_others(depth: Any, scene: Path, tmp_path: Path) -> None:
     completed = ("--sensor-depth", "sensor", "--views", 1)
     assert depth("whole", *completed).code == 0

@@ -7,12 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from deltas_nets.captures.frame import FloatArray, Lens
-from deltas_nets.captures.images import image_size_of, in_words
+from deltas_nets.captures.images import image_size_of, in_words, orientation_of
 from deltas_nets.errors import UserError
 
 __all__ = ["SizedCamera", "at_size", "doubts_of_sizes", "first_size"]
 
 EXIF_TURNED = "turn the files as their EXIF says, or estimate the poses of the files as they are"
+TURNED = "rotate the images back, or write size, intrinsics and poses of the images as they are"
+OF_ANOTHER_SHAPE = "use the images that the poses were estimated of"
+ON_A_SIDE = range(5, 9)
+"""What EXIF says of files that are to be turned by 90 degrees."""
 
 
 class SizedCamera(NamedTuple):
@@ -76,8 +80,10 @@ def at_size(
     if abs(columns - one * width) > 1 or abs(rows - one * height) > 1:
         what = f"the image is {in_words(size)}, its camera is for {in_words(stated)}"
         turned = abs(columns * height - rows * width) > abs(columns * width - rows * height)
-        remedy = EXIF_TURNED if turned else "use the images that the poses were estimated of"
-        raise UserError(what, image, remedy)
+        exif = turned and orientation_of(image) in ON_A_SIDE
+        raise UserError(
+            what, image, EXIF_TURNED if exif else TURNED if turned else OF_ANOTHER_SHAPE
+        )
     scaled = K.copy()
     scaled[:2] *= scale[:, None]
     scaled[:2, 2] += (scale - 1) / 2

@@ -120,9 +120,12 @@ def _check_name(name: str, path: Path) -> None:
     # A million names are checked so, and few need more than a look.
     framed = f"/{name}/"
     bad = "//" in framed or "/./" in framed or "/../" in framed or name[1:2] == ":"
-    if bad or not name.isprintable() or (4 * len(name) > NAME_LIMIT and _has_long_part(name)):
-        what = f"an image cannot be called {_shown(name)}"
+    what = f"an image cannot be called {_shown(name)}"
+    if bad or not name.isprintable():
         raise UserError(what, path, "name images by their path below the folder of images")
+    if 4 * len(name) > NAME_LIMIT and _has_long_part(name):
+        what += f", which has more than {NAME_LIMIT} bytes"
+        raise UserError(what, path, "shorten it: files of results are called so, with a suffix")
 
 
 def _has_long_part(name: str) -> bool:

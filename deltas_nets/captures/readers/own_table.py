@@ -62,6 +62,12 @@ MEANT = {
     "fl_y": "fy",
 }
 """What keys of other programs are called here."""
+PARTS = (
+    *("rotation", "rotation_matrix", "r", "rvec", "quaternion", "quat", "q", "orientation"),
+    *("euler", "euler_angles", "translation", "position", "location", "t", "tvec"),
+    *("qw", "qx", "qy", "qz", "tx", "ty", "tz"),
+)
+"""Keys of a part of a pose, of which here is one matrix."""
 
 
 def check_keys(fields: Fields, known: Iterable[str]) -> None:
@@ -75,5 +81,7 @@ def check_keys(fields: Fields, known: Iterable[str]) -> None:
         return
     near = difflib.get_close_matches(wrong.lower(), known, n=1, cutoff=0.6)
     meant = MEANT.get(wrong.lower()) or (near[0] if near else None)
+    if wrong.lower() in PARTS and "world_from_cam" in known:
+        meant = "world_from_cam, a 4x4 of the rotation as a matrix and of where the camera is"
     remedy = f"did you mean {meant}?" if meant else f"known are {', '.join(known)}"
     raise UserError(f"{fields.where} has an unknown key {wrong[:40]!r}", fields.path, remedy)

@@ -93,7 +93,7 @@ def read(path: Path) -> Capture:
             lost[id] = Lost("no image", error)
         else:
             camera = cameras[entry.camera]
-            depth_path, depth_scale = _depth(entry, depths)
+            depth_path, step = _depth(entry, depths)
             frames.append(
                 Frame(
                     id=id,
@@ -102,7 +102,8 @@ def read(path: Path) -> Capture:
                     K=camera.K,
                     cam_from_world=pose,
                     depth_path=depth_path,
-                    depth_scale=depth_scale,
+                    depth_scale=1 / step,
+                    depth_unit=step if "depth_file_path" in entry.frame else 1.0,
                     lens=camera.lens,
                 )
             )
@@ -225,7 +226,10 @@ def _depth_names(entries: list[_Entry]) -> list[str]:
 
 
 def _depth(entry: _Entry, finder: FileFinder) -> tuple[Path | None, float]:
-    """The depth of a frame, and its steps in a unit of the world."""
+    """The depth of a frame, and how long one of it is in units of the world.
+
+    nerfstudio multiplies floats by that, too; instant-ngp reads whole numbers alone.
+    """
     frame, root = entry.frame, entry.root
     key = _depth_key(frame)
     unit = DEPTHS[key]
@@ -233,8 +237,8 @@ def _depth(entry: _Entry, finder: FileFinder) -> tuple[Path | None, float]:
     if factor <= 0:
         raise root.error(f"has a {unit} of {factor:g}")
     if key not in frame:
-        return None, 1 / factor
-    return finder.find(frame.text(key), apart_from=entry.image), 1 / factor
+        return None, factor
+    return finder.find(frame.text(key), apart_from=entry.image), factor
 
 
 def _metric(root: Fields, entries: list[_Entry]) -> bool:

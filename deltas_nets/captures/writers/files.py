@@ -109,7 +109,7 @@ def put_depth(frame: Frame, target: Path, putting: Putting) -> PutDepth | None:
         None where the frame has no depth.
 
     Raises:
-        UserError: the file is missing, or holds floats of another unit.
+        UserError: the file is missing.
     """
     if frame.depth_path is None:
         return None
@@ -117,8 +117,7 @@ def put_depth(frame: Frame, target: Path, putting: Putting) -> PutDepth | None:
     if frame.depth_span is not None or suffix not in DEPTH_SUFFIXES:
         return write_millimetres(frame.read_depth(), target, frame)
     if suffix in FLOATS and frame.depth_unit != 1:
-        what = f"depth of {frame.id} is in floats of another unit than the capture is written in"
-        raise UserError(what, frame.depth_path, "scale the files, or leave depth out")
+        return _write_floats(frame.read_depth(), target, frame)
     file = target.with_name(target.name + suffix)
     _put(_Source(frame.depth_path, None), file, putting.placing, f"depth of {frame.id}")
     return PutDepth(file, frame.depth_scale)
@@ -145,6 +144,14 @@ def write_millimetres(depth: NDArray[np.float32], target: Path, frame: Frame) ->
     file.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.round(depth * MILLIMETRES).astype(np.uint16)).save(file)
     return PutDepth(file, MILLIMETRES)
+
+
+def _write_floats(depth: NDArray[np.float32], target: Path, frame: Frame) -> PutDepth:
+    """Write depth ``(H, W)`` in the capture's unit, where its floats are in another."""
+    file = target.with_name(f"{target.name}.npy")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.save(file, depth)
+    return PutDepth(file, frame.depth_scale)
 
 
 def _put(source: _Source, target: Path, placing: Placing, name: str) -> None:

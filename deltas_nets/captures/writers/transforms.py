@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame
-from deltas_nets.captures.depth_files import MILLIMETRES
+from deltas_nets.captures.depth_files import FLOATS, MILLIMETRES
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.ply_vertices import header_of, vertices_of
 from deltas_nets.captures.points import SparsePoints
@@ -45,8 +45,7 @@ def write(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     check_no_skew(capture, "transforms.json")
     for camera in capture.frames.arrays.cameras:
         _lens(camera.lens, capture.path)
-    scales = {camera.depth_scale for camera in capture.frames.arrays.cameras}
-    scale = scales.pop() if len(scales) == 1 else MILLIMETRES
+    scale = _scale(capture)
     root: dict[str, object] = {
         # Ours: others leave it alone, and without it no reader knows.
         "units": "metres" if capture.metric else "unknown",
@@ -62,6 +61,17 @@ def write(capture: Capture, folder: Path, putting: Putting) -> list[str]:
     frames = [_frame(frame, folder, putting, scale) for frame in capture.frames.values()]
     write_frames_json(folder / "transforms.json", root, frames)
     return said
+
+
+def _scale(capture: Capture) -> float:
+    """Of all depth, as the file has one: floats, which it goes for, too, are in the unit itself."""
+    stored = [frame for frame in capture.frames.values() if frame.depth_path is not None]
+    scales = {1.0 if _holds_floats(frame) else frame.depth_scale for frame in stored}
+    return scales.pop() if len(scales) == 1 else MILLIMETRES
+
+
+def _holds_floats(frame: Frame) -> bool:
+    return frame.depth_path is not None and frame.depth_path.suffix.lower() in FLOATS
 
 
 def _frame(frame: Frame, folder: Path, putting: Putting, scale: float) -> dict[str, object]:
@@ -87,7 +97,8 @@ def _frame(frame: Frame, folder: Path, putting: Putting, scale: float) -> dict[s
 
 def _put_depth(frame: Frame, target: Path, putting: Putting, scale: float) -> PutDepth | None:
     """Depth at the steps that the file states of all, which is what most have already."""
-    as_it_is = frame.depth_scale == scale and frame.depth_span is None
+    steps = 1.0 if _holds_floats(frame) else frame.depth_scale
+    as_it_is = steps == scale and frame.depth_span is None
     if frame.depth_path is None or (as_it_is and depth_is_registered(frame)):
         return put_registered_depth(frame, target, putting)
     if scale != MILLIMETRES:
