@@ -140,7 +140,7 @@ def _image_folders(folder: Path) -> list[Path]:
 def _entries(file: Path) -> list[_Entry]:
     """All frames of a file, images not looked for; ScanNet++ lists those kept for tests apart."""
     root = Fields(
-        read_json(file, name="transforms", remedy=REMEDY), file, where="it", remedy=REMEDY
+        read_json(file, name="transforms", remedy=REMEDY), file, where="the file", remedy=REMEDY
     )
     if not root.items("frames"):
         raise root.error("has no frames")
