@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.rigid import rigid_inverse
 from deltas_nets.captures.spread import spread
 from deltas_nets.page.maps import Maps, fused_in
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
@@ -65,10 +66,7 @@ def camera_of(frame: Frame) -> Camera:
     height, width = frame.image_size
     corners = np.array([[-0.5, width - 0.5], [-0.5, height - 0.5], [1, 1]])
     (left, right), (top, bottom), _ = np.linalg.solve(frame.K, corners).tolist()
-    R, t = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]
-    world_from_cam = np.eye(4)
-    world_from_cam[:3, :3], world_from_cam[:3, 3] = R.T, -R.T @ t
-    return Camera(frame.id, world_from_cam, (left, top, right, bottom))
+    return Camera(frame.id, rigid_inverse(frame.cam_from_world), (left, top, right, bottom))
 
 
 def up_of(capture: Capture) -> FloatArray:

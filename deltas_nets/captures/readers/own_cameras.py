@@ -11,9 +11,10 @@ from deltas_nets.captures.colmap_model import CAMERA_MODELS
 from deltas_nets.captures.frame import FloatArray, Lens
 from deltas_nets.captures.readers.image_sizes import SizedCamera, at_size, first_size
 from deltas_nets.captures.readers.json_file import Fields
-from deltas_nets.captures.readers.own_poses import matrix_of, rigid_inverse
+from deltas_nets.captures.readers.own_poses import matrix_of
 from deltas_nets.captures.readers.own_table import CAMERA, DEPTH_CAMERA, check_keys
-from deltas_nets.captures.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
+from deltas_nets.captures.rigid import rigid_inverse
 from deltas_nets.errors import UserError
 
 __all__ = [

@@ -33,7 +33,7 @@ from deltas_nets.captures.readers.names import (
     without_common_folder,
 )
 from deltas_nets.captures.readers.ply import read_points
-from deltas_nets.captures.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
 from deltas_nets.captures.readers.transforms_cameras import StatedCamera, stated_camera
 from deltas_nets.captures.readers.units import is_metric
 from deltas_nets.errors import UserError
