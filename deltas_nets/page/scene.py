@@ -76,21 +76,19 @@ def up_of(capture: Capture) -> FloatArray:
     return up / length if length > 0.2 else np.array([0.0, -1.0, 0.0])
 
 
-def layers_of(
-    maps: Maps, *, most_points: int = MOST_POINTS, most_faces: int = MOST_FACES
-) -> list[Layer]:
+def layers_of(maps: Maps) -> list[Layer]:
     """The mesh and the cloud of `deltas fuse`, else the points of the maps together.
 
     Raises:
         UserError: a file cannot be read.
     """
-    found = fused_layers(maps, most_points=most_points, most_faces=most_faces)
+    found = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
     if found:
         return found
     points = points_of_maps(maps)
     sure = points.confidence >= SURE
     surface = Surface(points.surface.xyz[sure], points.surface.rgb[sure])
-    return [Layer("points of the maps", thinned(surface, most_points))] if sure.any() else []
+    return [Layer("points of the maps", thinned(surface, MOST_POINTS))] if sure.any() else []
 
 
 def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer]:
@@ -107,7 +105,7 @@ def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer
     return [layer for layer in found if len(layer.surface.xyz)]
 
 
-def sparse_layer(capture: Capture, most_points: int = MOST_POINTS) -> Layer | None:
+def sparse_layer(capture: Capture, *, most_points: int) -> Layer | None:
     """The points that the capture's own program triangulated; None where there are none."""
     if capture.points is None or not len(capture.points.xyz):
         return None
