@@ -26,7 +26,6 @@ from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.usable import usable_view_sets
 from deltas_nets.captures.work_size import depth_at_image, fit_work_size, load_views
 from deltas_nets.distill.teachers import load_teacher
-from deltas_nets.evaluate.capture import resize_nearest
 from deltas_nets.evaluate.repeatability import (
     NUM_POINTS,
     TOLERANCE,
@@ -35,6 +34,7 @@ from deltas_nets.evaluate.repeatability import (
     repeatability,
     strongest_points,
 )
+from deltas_nets.evaluate.scores import resize_nearest
 from deltas_nets.network.lite.detector import detector_heatmap, spread_points
 from deltas_nets.weights_file import load_model
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from deltas_nets.config import NetworkConfig, from_dict, to_dict
@@ -119,10 +119,7 @@ def load_weights(model: torch.nn.Module, file: Path) -> None:
     Raises:
         UserError: a weight is missing, left over or of another shape.
     """
-    with safe_open(str(file), framework="pt") as opened:
-        names = opened.keys()
-        state: dict[str, Tensor] = {name: opened.get_tensor(name) for name in names}
-    _load(model, state, file)
+    _load(model, load_file(file), file)
 
 
 def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
@@ -137,8 +134,7 @@ def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
         UserError: a weight is left over or of another shape, or more than half are lacking: these
             are another network's.
     """
-    with safe_open(str(file), framework="pt") as opened:
-        state = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    state = load_file(file)
     own = model.state_dict()
     if not any(name.startswith(REDRAW) for name in own):
         state = {name: value for name, value in state.items() if not name.startswith(REDRAW)}

@@ -31,19 +31,6 @@ _UNITS = (0.01, 0.1, 0.5, 1.0, 2.0, 10.0, 1000.0)  # in a metre
 _RANGES = ((0.5, 5.0), (0.5, 10.0), (0.5, 20.0), (0.25, 10.0), (0.25, 20.0), (0.1, 50.0))
 _ORDERS = 5
 
-CURVES = (
-    "translation",
-    "rotation",
-    "calibration",
-    "blur",
-    "exposure",
-    "views",
-    "order",
-    "units",
-    "depth-range",
-)
-"""Names that the command takes."""
-
 
 def curve(name: str, seed: int = 0) -> Series:
     """A curve's steps.
@@ -155,3 +142,5 @@ _MAKERS: dict[str, Callable[[int], Series]] = {
     "units": _units,
     "depth-range": _depth_range,
 }
+CURVES = tuple(_MAKERS)
+"""Names that the command takes."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.varied import NetworkSettings
@@ -10,12 +11,11 @@ from deltas_nets.predict.predictor import Predictor, load_predictor
 __all__ = ["Series", "Step", "instead", "varied"]
 
 
-def _same(predictor: Predictor) -> Predictor:
-    return predictor
+T = TypeVar("T")
 
 
-def _same_views(views: ViewSet) -> ViewSet:
-    return views
+def _same(given: T) -> T:
+    return given
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Step:
     Raises:
         UserError: the network lacks the setting; the row says so.
     """
-    views: Callable[[ViewSet], ViewSet] = _same_views
+    views: Callable[[ViewSet], ViewSet] = _same
     """A view set to another."""
     search: tuple[float, float] | None = None
     """(near, far) of the search, metres; that of the command if None."""

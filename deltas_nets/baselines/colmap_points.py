@@ -36,15 +36,12 @@ def colmap() -> Any:
     return pycolmap
 
 
-def sparse_points(
-    frames: Sequence[Frame], depth_range: tuple[float, float], *, threads: int = 1
-) -> KeypointDepths:
+def sparse_points(frames: Sequence[Frame], depth_range: tuple[float, float]) -> KeypointDepths:
     """SIFT points of all frames, matched, verified and triangulated with the known cameras.
 
     Args:
         frames: the anchor and its sources; straight ones, their lens undone.
         depth_range: points nearer or farther are left out, metres.
-        threads: of COLMAP.
 
     Returns:
         Pixels and depths of the points that the anchor sees, at the size of its image. Only
@@ -63,7 +60,7 @@ def sparse_points(
         names = [f"{number:03}.png" for number in range(len(frames))]
         for frame, file in zip(frames, names, strict=True):
             Image.fromarray(frame.read_image()).save(images / file, compress_level=1)
-        found = _triangulated(pycolmap, folder, images, names, frames, poses, threads)
+        found = _triangulated(pycolmap, folder, images, names, frames, poses)
         points = _points_of_anchor(found, names[0])
     height, width = frames[0].image_size
     K = torch.from_numpy(frames[0].K.copy())
@@ -82,14 +79,13 @@ def _triangulated(
     names: Sequence[str],
     frames: Sequence[Frame],
     poses: FloatArray,
-    threads: int,
 ) -> Any:
     """COLMAP's reconstruction with the frames' cameras and poses as they are."""
     database, out = folder / "database.db", folder / "out"
     out.mkdir()
     extraction = pycolmap.FeatureExtractionOptions()
     matching = pycolmap.FeatureMatchingOptions()
-    extraction.num_threads = matching.num_threads = threads
+    extraction.num_threads = matching.num_threads = 1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     cpu = pycolmap.Device.cpu
@@ -120,7 +116,7 @@ def _triangulated(
         database, matching_options=matching, verification_options=verification, device=cpu
     )
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
+    options.num_threads = 1
     options.random_seed = 0
     return pycolmap.triangulate_points(model, database, images, out, options=options)
 

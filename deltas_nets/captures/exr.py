@@ -88,7 +88,8 @@ def read_exr(data: bytes, path: Path) -> NDArray[np.float32]:
         table = np.frombuffer(data, "<u8", header.num_chunks, header.end)
     except ValueError as error:
         raise UserError("the EXR file is truncated", path, "copy the file again") from error
-    top = _top(data, header, table, path)
+    # The first scan line's number need not be 0.
+    top = min((_chunk(data, offset, path)[0] for offset in table.tolist()), default=0)
     image = np.full((height, width), np.nan, dtype=np.float32)
     for offset in table.tolist():
         y, packed = _chunk(data, offset, path)
@@ -169,11 +170,6 @@ def _channels(value: bytes) -> tuple[_Channel, ...]:
         found.append(_Channel(value[place:end].decode("latin-1"), _TYPES[type]))
         place = end + 17
     return tuple(found)
-
-
-def _top(data: bytes, header: ExrHeader, table: NDArray[np.uint64], path: Path) -> int:
-    """The first scan line's number, which need not be 0."""
-    return min((_chunk(data, offset, path)[0] for offset in table.tolist()), default=0)
 
 
 def _chunk(data: bytes, offset: int, path: Path) -> tuple[int, memoryview]:

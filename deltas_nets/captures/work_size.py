@@ -9,7 +9,8 @@ from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_geom.cameras.views import PosedViews
-from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.rigid import rigid_inverse
 
 __all__ = [
     "anchor_views",
@@ -64,7 +65,7 @@ def anchor_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> Pose
         K ``(V, 3, 3)``, poses ``(V, 4, 4)``, float32.
     """
     intrinsics, poses = [], []
-    world_from_anchor = _rigid_inverse(frames[0].cam_from_world)
+    world_from_anchor = rigid_inverse(frames[0].cam_from_world)
     for frame in frames:
         K = torch.from_numpy(frame.K.copy())
         intrinsics.append(resize_intrinsics(K, old_size=frame.image_size, new_size=work_size))
@@ -158,13 +159,6 @@ def _nearest(scale: float, centre: float, depth_centre: float, size: int) -> NDA
     # Ties (every pixel, at twice the size) go one way, not as rounding errors fall.
     nearest: NDArray[np.intp] = np.floor(position + 0.5 - 1e-6).astype(np.intp)
     return nearest
-
-
-def _rigid_inverse(cam_from_world: FloatArray) -> FloatArray:
-    inverse = np.eye(4)
-    inverse[:3, :3] = cam_from_world[:3, :3].T
-    inverse[:3, 3] = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-    return inverse
 
 
 def _multiples_around(length: float) -> tuple[int, ...]:

@@ -58,14 +58,9 @@ def _by_cause(capture: Capture, suspicions: list[Suspicion | None]) -> Iterator[
         ids = () if mask.all() else tuple(capture.frames.kept(mask))
         first = known[0][1]
         right = {camera: one.right for camera, one in known if one.right is not None}
-        mend = (
-            changing_frames(with_K(dict(enumerate(_rights(camera_of, right))))) if right else None
-        )
+        of_frames = {place: right.get(int(camera)) for place, camera in enumerate(camera_of)}
+        mend = changing_frames(with_K(of_frames)) if right else None
         yield Finding(cause, first.evidence, ids, first.cure, "error", mend)
-
-
-def _rights(camera_of: np.ndarray, right: dict[int, FloatArray]) -> list[FloatArray | None]:
-    return [right.get(int(camera)) for camera in camera_of]
 
 
 def suspicion_of(

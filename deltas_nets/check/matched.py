@@ -70,11 +70,10 @@ def match_capture(
     capture: Capture,
     network: Deltas,
     *,
-    groups: int = GROUPS,
     threads: int = 1,
     report: Callable[[str], None] = lambda _: None,
 ) -> Matched:
-    """Match frames to their neighbours in time, at about ``groups`` places of a capture.
+    """Match frames to their neighbours in time, at about ``GROUPS`` places of a capture.
 
     How far apart neighbours are is chosen by how much the images move, never by poses: those are
     what is to be judged. Only where neighbours in time do not match, those by pose are tried.
@@ -82,12 +81,11 @@ def match_capture(
     Args:
         capture: two frames or more.
         network: with descriptors.
-        groups: how many places.
         threads: that look at places.
         report: called with the id of every anchor when it is done.
     """
     looked = _Looked(capture.frames, network)
-    anchors = _spread(len(capture.frames), groups)
+    anchors = _spread(len(capture.frames))
     rows: list[dict[int, Tensor]] = []
     found_in = side_by_side(lambda anchor: _group(capture, looked, anchor), anchors, threads)
     for anchor, found in zip(anchors, found_in, strict=True):
@@ -122,9 +120,9 @@ class _Looked:
         return int(match(first, second)[1].sum()) >= LEAST
 
 
-def _spread(count: int, groups: int) -> list[int]:
-    """Positions in the middle of ``groups`` equal parts."""
-    parts = (np.arange(groups) + 0.5) / groups
+def _spread(count: int) -> list[int]:
+    """Positions in the middle of ``GROUPS`` equal parts."""
+    parts = (np.arange(GROUPS) + 0.5) / GROUPS
     return sorted({int(position) for position in parts * count})
 
 
@@ -157,14 +155,14 @@ def _group(capture: Capture, looked: _Looked, anchor: int) -> dict[int, Tensor]:
     return found if len(found) > 1 else {}
 
 
-def _near_by_pose(frames: Frames, anchor: int, count: int = 4) -> Iterator[int]:
-    """Frames that look the same way from nearby, as far as poses are right."""
+def _near_by_pose(frames: Frames, anchor: int) -> Iterator[int]:
+    """Four frames that look the same way from nearby, as far as poses are right."""
     rotation, shift = frames.cam_from_world[:, :3, :3], frames.cam_from_world[:, :3, 3]
     centres = -np.einsum("fij,fi->fj", rotation, shift)
     distance = np.linalg.norm(centres - centres[anchor], axis=-1)
     usual = float(np.median(distance)) or 1.0
     cost = distance / usual + 1 - rotation[:, 2] @ rotation[anchor, 2]
-    yield from (int(position) for position in np.argsort(cost)[1 : count + 1])
+    yield from (int(position) for position in np.argsort(cost)[1:5])
 
 
 def _joined(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> Matched:

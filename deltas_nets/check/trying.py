@@ -98,9 +98,9 @@ class Case(NamedTuple):
         return tried(self.evidence, self.given, self.matched.views(mend(self.capture).frames))
 
 
-def searched(cost: Callable[[float], float], low: float = 0.2, high: float = 5.0) -> float:
-    """The factor of least cost, to 0.05 %; a grid first, as costs have many valleys."""
-    grid = np.exp(np.linspace(np.log(low), np.log(high), 53))
+def searched(cost: Callable[[float], float]) -> float:
+    """The factor of least cost, 0.2 to 5, to 0.05 %; a grid first, as costs have many valleys."""
+    grid = np.exp(np.linspace(np.log(0.2), np.log(5.0), 53))
     costs = [cost(float(factor)) for factor in grid]
     best = int(np.argmin(costs))
     center, width, least = float(grid[best]), float(np.log(grid[1] / grid[0])), costs[best]

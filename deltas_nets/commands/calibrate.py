@@ -7,8 +7,9 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,6 @@ class Calibrate(Command):
         """Run the command."""
         from rich.console import Console
 
-        from deltas_nets.commands.flags import usable_device
         from deltas_nets.evaluate.calibration import CalibrationMeter
         from deltas_nets.evaluate.fit_calibration import fit_calibration
         from deltas_nets.evaluate.report import calibration_table, sparsification_line
@@ -58,7 +58,6 @@ class Calibrate(Command):
             measure_rooms,
         )
         from deltas_nets.network.lite.calibration import VIEWS
-        from deltas_nets.terminal import progress
         from deltas_nets.weights_file import (
             check_new_weights,
             load_model,
@@ -104,10 +103,3 @@ class Calibrate(Command):
             raise UserError(f"no {self.rooms} rooms", "--rooms", "give 2 to 500")
         if not 2 <= self.views <= 12:
             raise UserError(f"no rooms of {self.views} views", "--views", "give 2 to 12")
-        if min(self.size) < 32:
-            raise UserError("images too small", "--size", "give HEIGHT WIDTH of 32 or more")
-        near, far = self.depth_range
-        if not 0 < near < far:
-            raise UserError(
-                f"no depth from {near:g} to {far:g}", "--depth-range", "give NEAR FAR, NEAR < FAR"
-            )

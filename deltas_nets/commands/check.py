@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, opened
+from deltas_nets.commands.flags import Flag, opened, usable_device
+from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress, warn
 
 MOST_THREADS = 4
 
@@ -60,10 +62,7 @@ class Check(Command):
         from deltas_nets.check.refused import refused
         from deltas_nets.check.verdict import Checked, check_capture
         from deltas_nets.check.words import mended_in_words, report_lines
-        from deltas_nets.commands.flags import usable_device
-        from deltas_nets.errors import UserError
         from deltas_nets.outputs.atomic_files import check_file, write_json
-        from deltas_nets.terminal import progress, warn
         from deltas_nets.weights_file import load_model
 
         if self.json is not None:

@@ -9,6 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, opened
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import counted, progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
@@ -73,7 +74,6 @@ class Convert(Command):
         from deltas_nets.captures.ids import ids_in_words
         from deltas_nets.captures.saving import doubts_of_images, save_capture
         from deltas_nets.captures.scaled import in_metres, scaled
-        from deltas_nets.terminal import counted, progress, warn
 
         capture = opened(self.capture, self.intrinsics)
         unit = self._unit(capture)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import NETWORKS, Flag, Network
+from deltas_nets.commands.flags import NETWORKS, Flag, Network, usable_device
 from deltas_nets.config import CONFIGS
 
 Measured = Literal[Network, "cost-volume", "reference"]
@@ -40,7 +40,6 @@ class Cost(Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.commands.flags import usable_device
         from deltas_nets.cost.command import run_cost
         from deltas_nets.network.networks import build_network
         from deltas_nets.outputs.atomic_files import check_file

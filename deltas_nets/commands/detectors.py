@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.commands.values import at_least_one, not_empty, not_negative, positive
 from deltas_nets.terminal import progress, warn
 
@@ -77,7 +77,6 @@ class Detectors(Command):
             self._of_capture()
 
     def _config(self) -> "TableConfig":
-        from deltas_nets.commands.flags import sensible
         from deltas_nets.evaluate.detectors.config import TableConfig
         from deltas_nets.evaluate.detectors.features import DetectionConfig
         from deltas_nets.evaluate.detectors.pose.consensus import ConsensusConfig

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.config.distill import DistillConfig
+from deltas_nets.terminal import progress
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,7 @@ class Distill(DistillConfig, Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.commands.flags import usable_device
         from deltas_nets.distill.training import distill
-        from deltas_nets.terminal import progress
         from deltas_nets.weights_file import read_metadata
 
         device = usable_device(self.device)

@@ -1,13 +1,15 @@
 """The command `deltas export`: the whole network as one file for other programs."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, sensible
+from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.values import at_least, at_least_one
 from deltas_nets.errors import UserError
 
 
@@ -43,6 +45,8 @@ class Export(Command):
     debug: Flag = False
     """Show the traceback of an error."""
 
+    checks: ClassVar = {"points": at_least(8), "refinement": at_least_one}
+
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.export import ExportConfig, export_onnx, export_program
@@ -55,8 +59,10 @@ class Export(Command):
             raise UserError("the suffix is the format", f"--out {self.out}", "use .onnx or .pt2")
         if self.out.exists() and not self.overwrite:
             raise UserError("the file exists", self.out, "add --overwrite or name another")
-        config = sensible(
-            ExportConfig,
+        if self.points > math.prod(self.size):
+            what = "there are fewer pixels than points"
+            raise UserError(what, f"--points {self.points}", "use fewer, or a larger --size")
+        config = ExportConfig(
             num_views=self.views,
             num_points=self.points,
             image_size=self.size,

@@ -8,7 +8,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.depth_telling import show_fused
-from deltas_nets.commands.flags import Flag, folder_for, opened, sensible
+from deltas_nets.commands.flags import Flag, folder_for, opened, sensible, usable_device
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import counted, progress, warn
@@ -100,7 +100,6 @@ class Fuse(Command):
 
     def fuse(self, capture: "Capture", out: Path) -> None:
         """Fuse maps of a capture that is open."""
-        from deltas_nets.commands.flags import usable_device
         from deltas_nets.fuse.config import FuseConfig
         from deltas_nets.fuse.fusing import fuse_capture
         from deltas_nets.fuse.sources import Predicted, depth_source

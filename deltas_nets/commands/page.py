@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, opened, sensible
+from deltas_nets.commands.flags import Flag, opened
 from deltas_nets.terminal import progress
 
 
@@ -43,9 +43,7 @@ class Page(Command):
         """Run the command."""
         from deltas_nets.page.maps import open_maps
         from deltas_nets.page.write import write_page
-        from deltas_nets.predict.depth_map import PredictConfig
 
-        sensible(PredictConfig, depth_range=self.depth_range)
         maps = open_maps(opened(self.capture, self.intrinsics), self.depths, self.fused)
         with progress("page", len(maps.ids)) as report:
             page = write_page(maps, depth_range=self.depth_range, report=report)

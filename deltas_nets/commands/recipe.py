@@ -7,10 +7,13 @@ from typing import Annotated
 
 import tyro
 
+from deltas_nets.commands.calibrate import Calibrate
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.train import encoder_file
 from deltas_nets.config.recipes import RECIPES, RecipeName
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,8 @@ class Recipe(Command):
         """Run the command."""
         import torch
 
-        from deltas_nets.commands.calibrate import Calibrate
-        from deltas_nets.commands.train import encoder_file
         from deltas_nets.distill.teachers import load_teacher
         from deltas_nets.outputs.atomic_files import check_writable
-        from deltas_nets.terminal import progress
         from deltas_nets.train.recipe import Beginning, add_redraw, begin, run_parts, sign
         from deltas_nets.weights_file import load_model, weights_file
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag
+from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.config.redraw import RedrawConfig
+from deltas_nets.terminal import progress
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,6 @@ class Redraw(RedrawConfig, Command):
 
     def run(self) -> None:
         """Run the command."""
-        from deltas_nets.commands.flags import usable_device
-        from deltas_nets.terminal import progress
         from deltas_nets.train.redraw import train_redraw
 
         device = usable_device(self.device)

@@ -113,7 +113,14 @@ class Train(Command):
         if self.init is None and not (self.resume and self.encoder == "pretrained"):
             encoder = encoder_file(self.encoder, config.network.backbone)
         init = None if self.init is None else weights_file(self.init)
-        start = Start(encoder, init, self.start_step, self.resume, self.teacher_weights)
+        start = Start(
+            encoder,
+            init,
+            self.start_step,
+            self.resume,
+            self.teacher_weights,
+            random_encoder=self.encoder == "none",
+        )
         weights = fit(
             config,
             self.out,

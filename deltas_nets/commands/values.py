@@ -10,7 +10,15 @@ from typing import Any
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
 
-__all__ = ["at_least_one", "check_values", "not_empty", "not_negative", "positive", "read_shard"]
+__all__ = [
+    "at_least",
+    "at_least_one",
+    "check_values",
+    "not_empty",
+    "not_negative",
+    "positive",
+    "read_shard",
+]
 
 LEAST_SIDE = 32  # px
 
@@ -78,14 +86,17 @@ def read_shard(text: str, flag: str = "--shard") -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def at_least_one(value: int, flag: str) -> None:
-    """A count of what there must be.
+def at_least(least: int) -> Callable[[int, str], None]:
+    """A check of a count that must be so much or more; it raises UserError where it is less."""
 
-    Raises:
-        UserError: it is less than 1.
-    """
-    if value < 1:
-        raise UserError("too few", f"{flag} {value}", "use 1 or more")
+    def check(value: int, flag: str) -> None:
+        if value < least:
+            raise UserError("too few", f"{flag} {value}", f"use {least} or more")
+
+    return check
+
+
+at_least_one = at_least(1)
 
 
 def not_empty(value: tuple[object, ...], flag: str) -> None:

@@ -69,7 +69,7 @@ def cost_of(
     """
     images, views = posed_noise(num_views, image_size=image_size)
     weight = next(model.parameters())
-    images, views = images.to(weight), PosedViews(*(tensor.to(weight) for tensor in views))
+    images, views = images.to(weight), views.to(weight)
 
     def run() -> object:
         return model(images, views, num_keypoints=num_keypoints)

@@ -11,31 +11,28 @@ import torch.nn.functional as F
 from kornia.geometry.subpix import nms2d
 from torch import Tensor
 
+from deltas_nets.losses.targets import NMS_RADIUS, in_cells
 from deltas_nets.network.lite.detector import CELL
 
 NONE = CELL * CELL
 """Channel of a cell without a point."""
 
 
-def hard_labels(scores: Tensor, *, threshold: float = 0.1, nms_radius: int = 2) -> Tensor:
+def hard_labels(scores: Tensor, *, threshold: float = 0.1) -> Tensor:
     """The channel of the strongest point in every cell.
 
     Args:
         scores: ``(B, 1, H, W)`` of a teacher.
         threshold: weaker local maxima are no points.
-        nms_radius: pixels between points, along an axis.
 
     Returns:
         ``(B, ceil(H/8), ceil(W/8))`` channel 0..63, or 64 where there is no point.
     """
-    cells = _cells(_peaks(scores, nms_radius))
-    best, channel = cells.max(dim=1)
+    best, channel = in_cells(_peaks(scores)).max(dim=1)
     return torch.where(best > threshold, channel, NONE)
 
 
-def soft_labels(
-    scores: Tensor, *, nms_radius: int = 2, gain: float = 1.0, blur: float = 0.5
-) -> Tensor:
+def soft_labels(scores: Tensor, *, gain: float = 1.0, blur: float = 0.5) -> Tensor:
     """A distribution over the channels of every cell: the points' scores, the rest "none".
 
     So the student learns how good a point is and not only where one is, and ranks as the
@@ -43,7 +40,6 @@ def soft_labels(
 
     Args:
         scores: ``(B, 1, H, W)`` of a teacher.
-        nms_radius: pixels between points, along an axis.
         gain: what the scores are multiplied by, for a teacher whose scores are small.
         blur: standard deviation in pixels of the spot that a point becomes; 0 is one pixel. A
             pixel beside the peak is almost right, and a point may lie near the edge of a cell.
@@ -51,21 +47,20 @@ def soft_labels(
     Returns:
         ``(B, 65, ceil(H/8), ceil(W/8))``, not negative, sum 1 over the channels.
     """
-    peaks = (gain * _peaks(scores, nms_radius)).clamp(max=1)
-    cells = _cells(_spots(peaks, blur) if blur > 0 else peaks)
+    peaks = (gain * _peaks(scores)).clamp(max=1)
+    cells = in_cells(_spots(peaks, blur) if blur > 0 else peaks)
     total = cells.sum(dim=1, keepdim=True)
     points = cells / total.clamp_min(1)
     return torch.cat([points, 1 - points.sum(dim=1, keepdim=True)], dim=1).clamp_min(0)
 
 
-def _peaks(scores: Tensor, nms_radius: int) -> Tensor:
-    window = 2 * nms_radius + 1
+def _peaks(scores: Tensor) -> Tensor:
+    window = 2 * NMS_RADIUS + 1
     # kornia leaves out maxima whose window leaves the image; the border's value is repeated
     # lower, so that they are maxima too.
-    padded = F.pad(scores, [nms_radius] * 4, value=-1.0)
+    padded = F.pad(scores, [NMS_RADIUS] * 4, value=-1.0)
     peaks: Tensor = nms2d(padded, (window, window))
-    inner = peaks[..., nms_radius:-nms_radius, nms_radius:-nms_radius] if nms_radius else peaks
-    return inner.clamp_min(0)
+    return peaks[..., NMS_RADIUS:-NMS_RADIUS, NMS_RADIUS:-NMS_RADIUS].clamp_min(0)
 
 
 def _spots(peaks: Tensor, blur: float) -> Tensor:
@@ -76,10 +71,3 @@ def _spots(peaks: Tensor, blur: float) -> Tensor:
     bell = bell / bell.sum()
     across = F.conv2d(peaks, bell.view(1, 1, 1, -1), padding=(0, radius))
     return F.conv2d(across, bell.view(1, 1, -1, 1), padding=(radius, 0))
-
-
-def _cells(maps: Tensor) -> Tensor:
-    """``(B, 64, ceil(H/8), ceil(W/8))``; cells that leave the image are filled with 0."""
-    height, width = maps.shape[-2:]
-    padded = F.pad(maps, (0, -width % CELL, 0, -height % CELL))
-    return F.pixel_unshuffle(padded, CELL)

@@ -14,9 +14,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.consistency import SeenMaps
 from deltas_nets.evaluate.points import score_keypoints
-from deltas_nets.evaluate.scores import CaptureScores as CaptureScores
-from deltas_nets.evaluate.scores import MapScores, mean_scores, score_map
-from deltas_nets.evaluate.scores import resize_nearest as resize_nearest
+from deltas_nets.evaluate.scores import CaptureScores, MapScores, mean_scores, score_map
 from deltas_nets.evaluate.truth import Truth, TruthSize
 from deltas_nets.outputs.depth_formats import read_depth_map
 from deltas_nets.outputs.summary import recorded_depth_scale
@@ -111,7 +109,6 @@ def evaluate_files(
     capture: Capture,
     view_sets: Sequence[ViewSet],
     *,
-    depth_range: tuple[float, float] = (0.5, 10.0),
     scoring: Scoring | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> CaptureScores:
@@ -121,9 +118,7 @@ def evaluate_files(
         predictions: its output folder, which holds depth/ID.png, npz, tiff or pfm.
         capture: frames with sensor depth.
         view_sets: whose anchors are scored.
-        depth_range: (near, far) of the true depth that counts, metres, where ``scoring`` is not
-            given.
-        scoring: how.
+        scoring: how; as `Scoring` has it if not given.
         report: called with the id of every finished frame.
 
     Raises:
@@ -135,7 +130,7 @@ def evaluate_files(
     def read(views: ViewSet) -> _Scored:
         return _Scored(read_depth_map(predictions, views.anchor, scale), None, None)
 
-    return _evaluate(read, capture, view_sets, scoring or Scoring(depth_range), None, report)
+    return _evaluate(read, capture, view_sets, scoring or Scoring(), None, report)
 
 
 def _predicted(

@@ -116,7 +116,7 @@ def predict_room(
     device = next(model.parameters()).device
     prediction: DepthPrediction = model(
         (room.images.float() / 255).to(device),
-        PosedViews(*(tensor.to(device) for tensor in room.views)),
+        room.views.to(device),
         depth_range,
     )
     return prediction

@@ -11,6 +11,13 @@ from torch import Tensor
 from deltas_geom import PosedViews, in_image, project, unproject
 from deltas_nets.network.lite.detector import CELL
 
+NMS_RADIUS = 2
+"""Pixels between interest points, along an axis."""
+QUALITY = 0.01
+"""Weakest response of an interest point, as a share of the image's strongest."""
+OCCLUSION_TOLERANCE = 0.04
+"""A point is hidden where a source sees something nearer by more than this share of its depth."""
+
 
 class Targets(NamedTuple):
     """Truth about the anchor's keypoints.
@@ -36,7 +43,6 @@ def keypoint_targets(
     keypoints: Tensor,
     *,
     depth_range: tuple[float, float],
-    occlusion_tolerance: float = 0.04,
 ) -> Targets:
     """True depth, points and matches of keypoints.
 
@@ -45,8 +51,6 @@ def keypoint_targets(
         depth: ``(B, V, H, W)`` metres, 0 = unknown.
         keypoints: ``(B, N, 2)`` of the anchor.
         depth_range: (near, far) metres.
-        occlusion_tolerance: a point is hidden when the source sees something nearer by more
-            than this share of its depth.
     """
     size = (depth.shape[-2], depth.shape[-1])
     at_keypoints = read_nearest(depth[:, :1], keypoints[:, None])[:, 0]
@@ -55,7 +59,7 @@ def keypoint_targets(
     points = unproject(views.select(0), keypoints[:, None], safe[:, None])[:, 0]
     there = project(views, points)
     surface = read_nearest(depth, there.pixels)
-    not_hidden = (surface > 0) & (there.depth < surface * (1 + occlusion_tolerance))
+    not_hidden = (surface > 0) & (there.depth < surface * (1 + OCCLUSION_TOLERANCE))
     visible = there.in_front & in_image(there.pixels, image_size=size) & not_hidden
     return Targets(
         torch.where(known, at_keypoints, 0.0),
@@ -78,15 +82,13 @@ def read_nearest(maps: Tensor, pixels: Tensor) -> Tensor:
     return maps.flatten(-2).gather(-1, index)
 
 
-def detector_labels(images: Tensor, *, quality: float = 0.01, nms_radius: int = 2) -> Tensor:
+def detector_labels(images: Tensor) -> Tensor:
     """Which pixel of each 8 x 8 cell is an interest point, ``(B, ceil(H/8), ceil(W/8))``.
 
     Interest points are local maxima of the Shi-Tomasi response.
 
     Args:
         images: ``(B, 3, H, W)`` RGB in [0, 1].
-        quality: weakest response kept, as a share of the image's strongest.
-        nms_radius: pixels between points.
 
     Returns:
         Channel 0..63 of the strongest point in the cell, row by row; 64 where there is none.
@@ -95,12 +97,14 @@ def detector_labels(images: Tensor, *, quality: float = 0.01, nms_radius: int = 
     """
     grey = images.mean(dim=1, keepdim=True)
     response = gftt_response(grey)
-    window = 2 * nms_radius + 1
-    peaks = nms2d(response, (window, window))
+    peaks = nms2d(response, (2 * NMS_RADIUS + 1, 2 * NMS_RADIUS + 1))
     strongest = response.amax(dim=(-2, -1), keepdim=True)
-    peaks = torch.where(peaks > quality * strongest, peaks, 0.0)
-    height, width = images.shape[-2:]
-    peaks = F.pad(peaks, (0, -width % CELL, 0, -height % CELL))
-    cells = F.pixel_unshuffle(peaks, CELL)
-    best, channel = cells.max(dim=1)
+    peaks = torch.where(peaks > QUALITY * strongest, peaks, 0.0)
+    best, channel = in_cells(peaks).max(dim=1)
     return torch.where(best > 0, channel, CELL * CELL)
+
+
+def in_cells(maps: Tensor) -> Tensor:
+    """``(B, 64, ceil(H/8), ceil(W/8))`` of ``(B, 1, H, W)``; beyond the image there is 0."""
+    height, width = maps.shape[-2:]
+    return F.pixel_unshuffle(F.pad(maps, (0, -width % CELL, 0, -height % CELL)), CELL)

@@ -12,7 +12,7 @@ import re
 import secrets
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import IO
 
@@ -27,6 +27,7 @@ __all__ = [
     "check_writable",
     "plain",
     "remove_abandoned",
+    "remove_temporary",
     "write_atomically",
     "write_json",
 ]
@@ -69,6 +70,13 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             raise cannot_write(path, error) from error
         raise
     _sync_folder(path.parent)
+
+
+def remove_temporary(files: Iterable[Path]) -> None:
+    """Remove those of some files that a killed run left half written."""
+    for path in files:
+        if TEMPORARY.match(path.name):
+            path.unlink(missing_ok=True)
 
 
 def remove_abandoned(folder: Path) -> None:

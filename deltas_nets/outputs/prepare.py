@@ -13,6 +13,7 @@ from deltas_nets.outputs.atomic_files import (
     cannot_write,
     check_writable,
     plain,
+    remove_temporary,
     write_json,
 )
 from deltas_nets.outputs.beside import remove_beside
@@ -93,8 +94,9 @@ def prepare_output(
             _mark_stopped(out, shard)
             planned = _not_planned(earlier, wanted, alone=alone)
             _remove_earlier(folder, {*frame_ids, *planned}, earlier, alone=alone)
-        if alone:
-            _remove_temporary(out)
+        if alone:  # else other shards may be writing
+            inside = (file for row in PRODUCTS for file in (out / row.name).rglob("*"))
+            remove_temporary([*out.glob("*"), *inside])
         folder.write_summary("running")
         if alone:
             remove_journals(out)
@@ -196,11 +198,3 @@ def _remove_shard_summaries(out: Path) -> None:
     for path in out.iterdir():
         if SHARD_SUMMARY.fullmatch(path.name):
             path.unlink()
-
-
-def _remove_temporary(out: Path) -> None:
-    """Remove what a killed run left half written; not beside other shards, which live."""
-    files = [*out.glob("*"), *(file for row in PRODUCTS for file in (out / row.name).rglob("*"))]
-    for path in files:
-        if TEMPORARY.match(path.name):
-            path.unlink(missing_ok=True)

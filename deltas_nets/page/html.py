@@ -81,12 +81,13 @@ def html_of(
         scale: of depth.
         depth_range: (near, far) of the true depth that counted, metres.
     """
+    shown = {kind for frame in frames for kind in frame.jpegs}
     data = {
         "name": maps.capture.path.resolve().name,
         "verdict": _verdict(maps),
         "facts": _facts(maps, frames, scale, depth_range),
         "notes": _notes(maps, frames),
-        "kinds": {kind: name for kind, name in KINDS.items() if kind in _kinds(frames)},
+        "kinds": {kind: name for kind, name in KINDS.items() if kind in shown},
         "scales": {kind: _scale(scale) for kind, scale in scales_of(scale).items()},
         "none": NONE,
         "frames": [_frame(maps, frame) for frame in frames],
@@ -116,10 +117,6 @@ def _encoded(count: int) -> int:
 
 def _base64(content: bytes | NDArray[np.generic]) -> str:
     return b64encode(content if isinstance(content, bytes) else content.tobytes()).decode("ascii")
-
-
-def _kinds(frames: Sequence[ShownFrame]) -> set[str]:
-    return {kind for frame in frames for kind in frame.jpegs}
 
 
 def _verdict(maps: Maps) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.rigid import rigid_inverse
 from deltas_nets.captures.spread import spread
 from deltas_nets.page.maps import Maps, fused_in
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
@@ -65,10 +66,7 @@ def camera_of(frame: Frame) -> Camera:
     height, width = frame.image_size
     corners = np.array([[-0.5, width - 0.5], [-0.5, height - 0.5], [1, 1]])
     (left, right), (top, bottom), _ = np.linalg.solve(frame.K, corners).tolist()
-    R, t = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]
-    world_from_cam = np.eye(4)
-    world_from_cam[:3, :3], world_from_cam[:3, 3] = R.T, -R.T @ t
-    return Camera(frame.id, world_from_cam, (left, top, right, bottom))
+    return Camera(frame.id, rigid_inverse(frame.cam_from_world), (left, top, right, bottom))
 
 
 def up_of(capture: Capture) -> FloatArray:
@@ -78,21 +76,19 @@ def up_of(capture: Capture) -> FloatArray:
     return up / length if length > 0.2 else np.array([0.0, -1.0, 0.0])
 
 
-def layers_of(
-    maps: Maps, *, most_points: int = MOST_POINTS, most_faces: int = MOST_FACES
-) -> list[Layer]:
+def layers_of(maps: Maps) -> list[Layer]:
     """The mesh and the cloud of `deltas fuse`, else the points of the maps together.
 
     Raises:
         UserError: a file cannot be read.
     """
-    found = fused_layers(maps, most_points=most_points, most_faces=most_faces)
+    found = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
     if found:
         return found
     points = points_of_maps(maps)
     sure = points.confidence >= SURE
     surface = Surface(points.surface.xyz[sure], points.surface.rgb[sure])
-    return [Layer("points of the maps", thinned(surface, most_points))] if sure.any() else []
+    return [Layer("points of the maps", thinned(surface, MOST_POINTS))] if sure.any() else []
 
 
 def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer]:
@@ -109,7 +105,7 @@ def fused_layers(maps: Maps, *, most_points: int, most_faces: int) -> list[Layer
     return [layer for layer in found if len(layer.surface.xyz)]
 
 
-def sparse_layer(capture: Capture, most_points: int = MOST_POINTS) -> Layer | None:
+def sparse_layer(capture: Capture, *, most_points: int) -> Layer | None:
     """The points that the capture's own program triangulated; None where there are none."""
     if capture.points is None or not len(capture.points.xyz):
         return None

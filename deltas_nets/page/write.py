@@ -10,7 +10,7 @@ from PIL import Image
 
 from deltas_nets.captures.spread import spread
 from deltas_nets.evaluate.scores import resize_nearest
-from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically
+from deltas_nets.outputs.atomic_files import remove_temporary, write_atomically
 from deltas_nets.outputs.beside import PAGE, PREVIEWS, SHEET, preview_file
 from deltas_nets.page.budget import MOST_BYTES, choose
 from deltas_nets.page.colours import Scale, coloured, depth_scale, with_bar
@@ -69,7 +69,7 @@ def write_page(
         UserError: a file cannot be read or written. The page of before, if any, stays then.
     """
     folder = maps.folder
-    _remove_temporary(folder / PREVIEWS)
+    remove_temporary((folder / PREVIEWS).rglob("*"))
     scale = depth_scale(sample_of_depth(maps), maps.unit)
     layers = layers_of(maps)
 
@@ -99,13 +99,6 @@ def write_page(
         content = html_of(maps, frames, layers, scale, depth_range)
     write_atomically(folder / PAGE, lambda file: file.write(content))
     return Page(folder / PAGE, len(maps.ids), len(frames), len(content))
-
-
-def _remove_temporary(folder: Path) -> None:
-    """Remove what a killed run left half written."""
-    for file in folder.rglob("*"):
-        if TEMPORARY.match(file.name):
-            file.unlink(missing_ok=True)
 
 
 def _write_preview(path: Path, depth: NDArray[np.float32], scale: Scale) -> None:

@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 
-from deltas_geom import PosedViews
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import load_views
@@ -60,8 +59,7 @@ class DensePredictor(ViewsAlone):
         config, work_size = wanted.config, work_size_of(wanted.anchor, wanted.config)
         device = next(self.model.parameters()).device
         images, views = load_views(wanted.frames, work_size=work_size)
-        of_device = PosedViews(*(part.to(device) for part in views))
-        found = self.model(images.to(device), of_device, config.depth_range)
+        found = self.model(images.to(device), views.to(device), config.depth_range)
         work = KnownDepth(found.depth, found.std / found.depth)
         return finished_map(wanted.anchor, work, keypoint_depths(found), config)
 

@@ -52,9 +52,8 @@ class DescribedFrames:
             UserError: an image cannot be read.
         """
         device = next(self.encode.model.parameters()).device
-        there = KnownDepth(*(part.to(device) for part in found))
-        moved = compared(there, self(anchor), [self(other) for other in others])
-        return KnownDepth(*(part.cpu() for part in moved))
+        own, *around = map(self, (anchor, *others))
+        return compared(found.to(device), own, around).to("cpu")
 
     def __call__(self, seen: AtSize) -> Described:
         """A frame's descriptors and its camera at their size.

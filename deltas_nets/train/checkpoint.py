@@ -14,7 +14,7 @@ from deltas_nets.config import TrainConfig, from_dict, to_dict, without_paths
 from deltas_nets.errors import UserError
 from deltas_nets.network.networks import Network
 from deltas_nets.network.torch_file import read_torch_file
-from deltas_nets.outputs.atomic_files import TEMPORARY, write_atomically, write_json
+from deltas_nets.outputs.atomic_files import write_atomically, write_json
 from deltas_nets.train.average import RunningAverage
 from deltas_nets.train.provenance import Provenance, record_of
 from deltas_nets.weights_file import save_weights
@@ -58,13 +58,6 @@ def save_run(folder: Path, config: TrainConfig, state: RunState, provenance: Pro
         "optimizer": state.optimizer.state_dict(),
     }
     write_atomically(folder / CHECKPOINT, lambda file: torch.save(content, file))
-
-
-def remove_half_written(folder: Path) -> None:
-    """Remove what a killed run was writing."""
-    for path in folder.iterdir():
-        if TEMPORARY.match(path.name):
-            path.unlink(missing_ok=True)
 
 
 def load_config(folder: Path) -> TrainConfig:

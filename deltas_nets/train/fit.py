@@ -13,9 +13,10 @@ from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.rooms import evaluate_rooms
+from deltas_nets.outputs.atomic_files import remove_temporary
 from deltas_nets.rooms import Rooms
 from deltas_nets.train.batches import BatchMaker
-from deltas_nets.train.checkpoint import WEIGHTS, remove_half_written, save_run
+from deltas_nets.train.checkpoint import WEIGHTS, save_run
 from deltas_nets.train.data_sets import training_data, validation_data
 from deltas_nets.train.loader import step_loader
 from deltas_nets.train.log import FolderLog, RunLog
@@ -91,7 +92,7 @@ def fit(
 
     if fabric.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
-        remove_half_written(folder)
+        remove_temporary(folder.iterdir())
     save()  # before the first step, so that a run can always be resumed
     failures = 0
     log_of_run = _log(fabric, folder, config, step, report)

@@ -48,12 +48,14 @@ def record_of(config: TrainConfig, provenance: Provenance) -> dict[str, str]:
     return record
 
 
-def check_began(began: Mapping[str, str] | None, given: Mapping[str, str], folder: Path) -> None:
+def check_began(
+    began: Mapping[str, str] | None, given: Mapping[str, str | None], folder: Path
+) -> None:
     """Whether a run goes on with the files and the step that it began with, as far as given.
 
     Args:
         began: by option; None of a run of before they were kept.
-        given: the same of what it is to go on with.
+        given: the same of what it is to go on with; None where that is no file.
         folder: of the run.
 
     Raises:

@@ -39,6 +39,7 @@ class Start:
             beside it are only compared with those that the run began with.
         teacher: weights of the teacher that the config names. They are in no checkpoint: to go on
             it is given again.
+        random_encoder: an encoder of random weights is asked for, rather than nothing said.
     """
 
     encoder: Path | None = None
@@ -46,6 +47,7 @@ class Start:
     step: int = 0
     resume: bool = False
     teacher: Path | None = None
+    random_encoder: bool = False
 
     def began(self) -> dict[str, str]:
         """SHA-256 of each file that is named, by its option, and the step if it is not 0."""
@@ -57,6 +59,10 @@ class Start:
             for option, file in files.items()
             if file is not None
         }
+
+    def said(self) -> dict[str, str | None]:
+        """What a run to go on with is said to have begun with; None is of no file."""
+        return ({"--encoder": None} if self.random_encoder else {}) | self.began()
 
 
 class Started(NamedTuple):
@@ -126,7 +132,7 @@ def starting_state(
     provenance = Provenance(origin, before, start.began())
     if start.resume:
         state, provenance = load_run(folder, state)
-        check_began(provenance.began, start.began(), folder)
+        check_began(provenance.began, start.said(), folder)
     prepare_batch_norm(model, config, processes=fabric.world_size)
     if teacher is None:
         return Started(state, provenance, None)

@@ -101,7 +101,7 @@ def open_viewer(
         fused = fused_layers(maps, most_points=MOST_POINTS, most_faces=MOST_FACES)
         points = _fewer(points_of_maps(maps))
         points = points if len(points.confidence) else None
-    sparse = sparse_layer(capture, MOST_POINTS)
+    sparse = sparse_layer(capture, most_points=MOST_POINTS)
     clouds = [layer.surface.xyz for layer in fused]
     clouds += [] if points is None else [points.surface.xyz]
     clouds += [] if sparse is None else [sparse.surface.xyz]

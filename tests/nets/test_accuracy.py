@@ -11,7 +11,8 @@ from deltas_nets import cli, load_model
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import read_view_sets
-from deltas_nets.evaluate.capture import CaptureScores, evaluate_network
+from deltas_nets.evaluate.capture import evaluate_network
+from deltas_nets.evaluate.scores import CaptureScores
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.ours import DeltasPredictor
 

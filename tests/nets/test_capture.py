@@ -13,7 +13,7 @@ from small_capture import K_FILE
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
-from deltas_nets.captures.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
 from deltas_nets.errors import UserError
 
 MakeCapture = Callable[..., Path]

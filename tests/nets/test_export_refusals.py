@@ -150,7 +150,9 @@ def test_the_command_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
         run("export", "--out", out, "--weights", "plane-sweep"), "plane-sweep: name del"
     )
     small = ["export", "--out", out, "--size", 32, 32]
-    assert_one_line(run(*small, "--points", 10**6), "fewer pixels than points")
+    assert_one_line(run(*small, "--points", 10**6), "fewer pixels than points", "--points 1000000")
+    assert_one_line(run(*small, "--points", 7), "--points 7: use 8 or more")
+    assert_one_line(run(*small, "--refinement", 0), "--refinement 0: use 1 or more")
     assert_one_line(run("export"), "--out", "see deltas export --help")
     assert not out.exists()
 

@@ -313,7 +313,11 @@ def test_what_a_csv_lacks_is_said_as_a_csv_has_it(
 
 def test_what_is_wrong_is_said_where_it_stands(tmp_path: Path) -> None:
     named = {"cameras": {"left": {"fx": "9"}}, "frames": changed(camera="left")}
-    wrong = {"it has a fx": {"fx": "9"}, "left of cameras of it has a fx": named}
+    wrong = {
+        "^the file has a fx": {"fx": "9"},
+        "^left of cameras of the file has a fx": named,
+        "^the file's units are feet": {"units": "feet"},
+    }
     wrong[r"frame 0 \(images/a.png\) has a fx"] = {"frames": changed(fx="9")}
     for what, root in wrong.items():
         with pytest.raises(UserError, match=what):

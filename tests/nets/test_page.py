@@ -95,9 +95,7 @@ def test_errors_are_those_of_evaluate(filled: tuple[Path, Path]) -> None:
     capture, folder = filled
     page_of(capture, folder)
     facts = {name: value for name, value, _ in data_of(folder)["facts"]}
-    scores = evaluate_files(
-        folder, open_capture(capture), recorded_view_sets(folder), depth_range=(0.5, 10)
-    )
+    scores = evaluate_files(folder, open_capture(capture), recorded_view_sets(folder))
     assert facts["Abs Rel"] == f"{scores.dense.abs_rel:.3f}" == "0.102"
     assert facts["δ < 1.25"] == f"{scores.dense.delta1:.3f}"
 

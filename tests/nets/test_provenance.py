@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from run_command import Run, assert_one_line
 from run_fit import CONFIG, train
 from safetensors.torch import save_file
 
@@ -12,6 +13,7 @@ from deltas_nets.config import DataConfig, TrainConfig
 from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.lite.efficientnet import EfficientNetLite0
 from deltas_nets.train import start as start_module
 from deltas_nets.train.fit import Start
 from deltas_nets.train.provenance import OURS, Provenance, record_of
@@ -102,3 +104,16 @@ def test_a_run_goes_on_with_the_files_that_it_began_with(
     ):
         with pytest.raises(UserError, match=f"did not begin with this, {option}: "):
             train(run, config, changed, stop=1)
+
+
+def test_a_run_of_a_pretrained_encoder_does_not_go_on_as_one_of_random_weights(
+    tmp_path: Path, run: Run
+) -> None:
+    encoder, out = tmp_path / "lite0.pth", tmp_path / "run"
+    torch.save(EfficientNetLite0().state_dict(), encoder)
+    train(out, CONFIG, Start(encoder), stop=1)
+    told = run("train", "--out", out, "--resume", "--encoder", "none")
+    assert_one_line(told, "did not begin with this", "--encoder", "leave that option out")
+    random = tmp_path / "random"
+    train(random, CONFIG, Start(random_encoder=True), stop=1)
+    train(random, CONFIG, Start(resume=True, random_encoder=True), stop=1)

@@ -322,11 +322,11 @@ def test_nonsense_is_one_error_that_names_the_file(
 @pytest.mark.parametrize(
     ("root", "frame", "what"),
     [
-        ({"fl_x": "9"}, {}, "it has a fl_x"),
-        ({"w": 0}, {}, "it has a size"),
+        ({"fl_x": "9"}, {}, "the file has a fl_x"),
+        ({"w": 0}, {}, "the file has a size"),
         ({}, {"fl_x": "9"}, "frame 0 (images/a.png) has a fl_x"),
-        ({"cx": "4"}, {"fl_x": 9}, "it has a cx"),
-        ({"fl_x": None}, {}, "it has no focal length"),
+        ({"cx": "4"}, {"fl_x": 9}, "the file has a cx"),
+        ({"fl_x": None}, {}, "the file has no focal length"),
         ({"fl_x": None}, {"K": [[9, 0, 4], [0, 9, 3], [0, 0, 1]]}, "but K; write fl_x"),
         ({"fl_x": None, "camera_angle_x": 57.17}, {}, "57.17, not between 0 and pi (degrees? say"),
     ],

@@ -153,11 +153,11 @@ def test_what_differs_from_the_run_to_go_on_with_is_named(tmp_path: Path) -> Non
     teacher, another = tmp_path / "teacher.pth", tmp_path / "another.pth"
     teacher.write_bytes(b"1")
     another.write_bytes(b"2")
-    first = Beginning("night", 0.5, None, teacher)
+    out, first = tmp_path / "run", Beginning("night", 0.5, None, teacher)
     for _ in range(2):
-        begin(tmp_path, first)
+        begin(out, first)
     moved = teacher.rename(tmp_path / "moved").rename(tmp_path / "teacher.pth")
-    begin(tmp_path, first._replace(teacher=moved))
+    begin(out, first._replace(teacher=moved))
     for other, said in (
         (first._replace(name="hour"), "night"),
         (first._replace(effort=1.0), "with 0.5: effort"),
@@ -166,10 +166,10 @@ def test_what_differs_from_the_run_to_go_on_with_is_named(tmp_path: Path) -> Non
         (first._replace(teacher=another), "with teacher.pth"),
     ):
         with pytest.raises(UserError, match=said):
-            begin(tmp_path, other)
-    (tmp_path / RECORD).write_text("{")
+            begin(out, other)
+    (out / RECORD).write_text("{")
     with pytest.raises(UserError, match="not readable"):
-        begin(tmp_path, first)
+        begin(out, first)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")

@@ -1,4 +1,4 @@
-"""Camera matrices from the numbers that formats state."""
+"""Camera matrices and sizes from the numbers that formats state."""
 
 from pathlib import Path
 
@@ -7,9 +7,10 @@ import numpy as np
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.images import in_words
 from deltas_nets.captures.readers.image_sizes import SizedCamera, at_size
+from deltas_nets.captures.readers.json_file import Fields
 from deltas_nets.errors import UserError
 
-__all__ = ["CORNER", "camera_matrix", "fitted"]
+__all__ = ["CORNER", "camera_matrix", "fitted", "size_of"]
 
 CORNER = 0.5
 """What is subtracted from principal points of programs that put the image's corner at 0."""
@@ -34,6 +35,19 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, path: Path) -> 
         raise UserError(what, path, "state focal lengths and principal point in pixels")
     K.setflags(write=False)
     return K
+
+
+def size_of(fields: Fields, height: str, width: str) -> tuple[int, int]:
+    """(height, width) of images, as two fields state it.
+
+    Raises:
+        UserError: a number is missing, or is no number of pixels.
+    """
+    sides = fields.number(height), fields.number(width)
+    if not all(1 <= side < 2**20 and side == int(side) for side in sides):
+        what = f"has a size of {sides[1]:g} x {sides[0]:g} pixels"
+        raise fields.error(what, width)
+    return int(sides[0]), int(sides[1])
 
 
 def fitted(

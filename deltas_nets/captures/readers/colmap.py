@@ -28,6 +28,7 @@ from deltas_nets.captures.readers.image_sizes import (
     first_size,
 )
 from deltas_nets.captures.readers.names import frame_ids, without_common_folder
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
@@ -103,8 +104,7 @@ def capture_of_model(
     lost: dict[str, Lost] = {}
     frame_of_image: dict[int, str] = {}
     for position, (id, image) in enumerate(zip(ids, images, strict=True)):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotations[position], model.images.translations[position]
+        pose = rigid(rotations[position], model.images.translations[position])
         if not np.isfinite(pose).all():
             error = UserError(f"the pose of {id} is not finite", file, "estimate it again")
             lost[id] = Lost("no pose", error)

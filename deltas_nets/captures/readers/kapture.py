@@ -18,7 +18,8 @@ from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.names import frame_ids
-from deltas_nets.captures.readers.poses import cam_from_world, rigid
+from deltas_nets.captures.readers.poses import cam_from_world
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError

@@ -14,7 +14,8 @@ from deltas_nets.captures.readers.cameras import camera_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.names import IMAGE_SUFFIXES, frame_ids
-from deltas_nets.captures.readers.poses import cam_from_world_of, rigid
+from deltas_nets.captures.readers.poses import cam_from_world_of
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "recognises"]

@@ -15,8 +15,9 @@ from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.names import frame_ids, name_parts
-from deltas_nets.captures.readers.poses import cam_from_world, rigid
+from deltas_nets.captures.readers.poses import cam_from_world
 from deltas_nets.captures.readers.sparse import observed
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.errors import UserError
 
 __all__ = ["read", "recognises"]

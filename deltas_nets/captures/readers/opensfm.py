@@ -15,12 +15,9 @@ from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.names import frame_ids
-from deltas_nets.captures.readers.poses import (
-    cam_from_world,
-    rigid,
-    rotation_of_vector,
-)
+from deltas_nets.captures.readers.poses import cam_from_world, rotation_of_vector
 from deltas_nets.captures.readers.sparse import observed
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 

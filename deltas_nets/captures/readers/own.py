@@ -171,7 +171,7 @@ def _root(file: Path) -> Fields:
     values = (
         read_csv(file) if file.suffix == ".csv" else read_json(file, name="frames", remedy=REMEDY)
     )
-    root = Fields(values, file, where="it", remedy=REMEDY)
+    root = Fields(values, file, where="the file", remedy=REMEDY)
     version = root.number("version", VERSION)
     if version != VERSION:
         what = f"the file is of version {version:g}, this program reads {VERSION}"

@@ -9,11 +9,13 @@ import numpy as np
 
 from deltas_nets.captures.colmap_model import CAMERA_MODELS
 from deltas_nets.captures.frame import FloatArray, Lens
+from deltas_nets.captures.readers.cameras import size_of
 from deltas_nets.captures.readers.image_sizes import SizedCamera, at_size, first_size
 from deltas_nets.captures.readers.json_file import Fields
-from deltas_nets.captures.readers.own_poses import matrix_of, rigid_inverse
+from deltas_nets.captures.readers.own_poses import matrix_of
 from deltas_nets.captures.readers.own_table import CAMERA, DEPTH_CAMERA, check_keys
-from deltas_nets.captures.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
+from deltas_nets.captures.rigid import rigid_inverse
 from deltas_nets.errors import UserError
 
 __all__ = [
@@ -93,7 +95,9 @@ def _camera(values: Fields, offset: float) -> OwnCamera:
     if min(fx, fy) <= 0:
         raise values.error(f"has focal lengths that are not positive ({fx:g} and {fy:g})", "fx")
     centre = values.number("cx") - offset, values.number("cy") - offset
-    return OwnCamera((fx, fy), centre, _lens(values), _size(values))
+    lens, says_size = _lens(values), "width" in values or "height" in values
+    size = size_of(values, "height", "width") if says_size else None
+    return OwnCamera((fx, fy), centre, lens, size)
 
 
 def _lens(values: Fields) -> Lens | None:
@@ -115,15 +119,6 @@ def _lens(values: Fields) -> Lens | None:
         count = model.num_coefficients
         raise values.error(f"has {len(numbers)} coefficients; {name} has {count}", "coefficients")
     return None if model.straight and not any(numbers) else Lens(name, numbers)
-
-
-def _size(values: Fields) -> tuple[int, int] | None:
-    if "width" not in values and "height" not in values:
-        return None
-    height, width = values.number("height"), values.number("width")
-    if not all(1 <= side < 2**20 and side == int(side) for side in (height, width)):
-        raise values.error(f"has a size of {width:g} x {height:g} pixels", "width")
-    return int(height), int(width)
 
 
 def depth_camera(

@@ -11,6 +11,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.json_file import Fields
+from deltas_nets.captures.readers.own_cameras import pixel_centre
 from deltas_nets.captures.readers.own_table import REMEDY
 from deltas_nets.captures.text_lines import decoded
 from deltas_nets.errors import UserError
@@ -70,8 +71,7 @@ def _observations(
         raise UserError(what, file, "count both from 0, as they stand in their files")
     position = {id: place for place, id in enumerate(frames)}
     place = np.array([position.get(id, -1) for id in ids])[frame.astype(np.int64)]
-    offset = 0.5 if root.text("pixel_centres", "integers") == "halves" else 0.0
-    stated = table[:, 2:] - offset
+    stated = table[:, 2:] - pixel_centre(root)
     # As K: the corner, half a pixel before the first centre, stays where it is.
     pixels = (stated + 0.5) * scales[frame.astype(np.int64)] - 0.5
     used = place >= 0

@@ -5,10 +5,11 @@ import numpy as np
 from deltas_nets.captures.capture import Lost
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.readers.json_file import Fields
-from deltas_nets.captures.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
+from deltas_nets.captures.rigid import rigid_inverse
 from deltas_nets.errors import UserError
 
-__all__ = ["matrix_of", "pose_of", "rigid_inverse"]
+__all__ = ["matrix_of", "pose_of"]
 
 
 def pose_of(frame: Fields) -> FloatArray | Lost:
@@ -31,14 +32,6 @@ def pose_of(frame: Fields) -> FloatArray | Lost:
     except UserError as error:
         what = f"{frame.where}: {error.what}"
         return Lost("not rigid", UserError(what, frame.path, error.remedy))
-
-
-def rigid_inverse(rigid: FloatArray) -> FloatArray:
-    """The inverse of a rigid ``(4, 4)``."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = rigid[:3, :3].T
-    inverse[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
-    return inverse
 
 
 def matrix_of(frame: Fields, key: str) -> FloatArray:

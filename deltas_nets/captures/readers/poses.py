@@ -9,6 +9,7 @@ from deltas_nets.captures.capture import Lost
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.readers.rigid import why_not_rigid
+from deltas_nets.captures.rigid import rigid, rigid_inverse
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 
@@ -17,20 +18,13 @@ __all__ = [
     "cam_from_world",
     "cam_from_world_of",
     "missing_images",
-    "rigid",
     "rotation_of_vector",
+    "world_from_cam_inverse",
 ]
 
 OPENGL = np.array([1.0, -1, -1, 1])
 """What the columns of a camera-to-world matrix are multiplied by where the camera's y points up and
 it looks along -z."""
-
-
-def rigid(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """``(4, 4)`` from ``(3, 3)`` and ``(3,)``."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
 
 
 def cam_from_world(matrix: FloatArray, *, id: str, path: Path) -> FloatArray | Lost:
@@ -52,8 +46,7 @@ def cam_from_world(matrix: FloatArray, *, id: str, path: Path) -> FloatArray | L
     if why is not None:
         what = f"the pose of frame {id} {why.what}"
         return Lost("not rigid", UserError(what, path, why.remedy))
-    left, _, right = np.linalg.svd(matrix[:3, :3])
-    pose = rigid(left @ right, matrix[:3, 3])
+    pose = _nearest_rigid(matrix)
     pose.setflags(write=False)
     return pose
 
@@ -63,9 +56,36 @@ def cam_from_world_of(world_from_cam: FloatArray, *, id: str, path: Path) -> Flo
     pose = cam_from_world(world_from_cam, id=id, path=path)
     if isinstance(pose, Lost):
         return pose
-    inverse = rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
+    inverse = rigid_inverse(pose)
     inverse.setflags(write=False)
     return inverse
+
+
+def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
+    """The rigid inverse of a finite pose, rounded by printing as it may be.
+
+    Args:
+        world_from_cam: ``(4, 4)``.
+        path: the file it came from, for the error.
+
+    Returns:
+        ``(4, 4)``, read-only, whose rotation is orthogonal to float64 precision.
+
+    Raises:
+        UserError: the matrix is not a rotation and a translation.
+    """
+    why = why_not_rigid(world_from_cam)
+    if why is not None:
+        raise UserError(f"the pose {why.what}", path, why.remedy)
+    inverse = rigid_inverse(_nearest_rigid(world_from_cam))
+    inverse.setflags(write=False)
+    return inverse
+
+
+def _nearest_rigid(matrix: FloatArray) -> FloatArray:
+    """The nearest rotation, else R^T is not the inverse of R and the rounding of the file stays."""
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    return rigid(left @ right, matrix[:3, 3])
 
 
 def rotation_of_vector(vector: FloatArray) -> FloatArray:

@@ -11,7 +11,8 @@ from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.numbered import numbered_files
-from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of, rigid
+from deltas_nets.captures.readers.poses import OPENGL, cam_from_world_of
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.captures.rotations import rotations_of
 from deltas_nets.errors import UserError
 

@@ -10,12 +10,12 @@ from deltas_nets.captures.capture import Capture, FloatArray, Frame, Lost
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrinsics
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
 from deltas_nets.captures.readers.refused import known_layout
-from deltas_nets.captures.readers.rigid import why_not_rigid
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
-__all__ = ["NESTING", "is_scene", "read", "recognises", "world_from_cam_inverse"]
+__all__ = ["NESTING", "is_scene", "read", "recognises"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
@@ -157,33 +157,6 @@ def _find_files(scene: Path) -> _SceneFiles:
         doubts.append(_other_shape(depth_size, image_size, depth_file))
     said = tuple(doubt for doubt in doubts if doubt is not None)
     return _SceneFiles(images, poses, depths, image_size, K, depth_K, depth_size, said)
-
-
-def world_from_cam_inverse(world_from_cam: FloatArray, *, path: Path) -> FloatArray:
-    """The rigid inverse of a finite pose, rounded by printing as it may be.
-
-    Args:
-        world_from_cam: ``(4, 4)``.
-        path: the file it came from, for the error.
-
-    Returns:
-        ``(4, 4)`` whose rotation is orthogonal to float64 precision.
-
-    Raises:
-        UserError: the matrix is not a rotation and a translation.
-    """
-    why = why_not_rigid(world_from_cam)
-    if why is not None:
-        raise UserError(f"the pose {why.what}", path, why.remedy)
-    rotation, centre = world_from_cam[:3, :3], world_from_cam[:3, 3]
-    # The nearest rotation, else R^T is not the inverse of R and the rounding of the file stays.
-    left, _, right = np.linalg.svd(rotation)
-    nearest = left @ right
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = nearest.T
-    cam_from_world[:3, 3] = -nearest.T @ centre
-    cam_from_world.setflags(write=False)
-    return cam_from_world
 
 
 def is_scene(path: Path) -> bool:

@@ -11,7 +11,8 @@ from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.names import frame_ids
-from deltas_nets.captures.readers.poses import cam_from_world_of, rigid
+from deltas_nets.captures.readers.poses import cam_from_world_of
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 

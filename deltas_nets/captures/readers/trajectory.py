@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deltas_nets.captures.frame import FloatArray
-from deltas_nets.captures.readers.poses import rigid
+from deltas_nets.captures.rigid import rigid
 from deltas_nets.captures.rotations import rotations_of
 
 __all__ = ["GAP", "Trajectory", "nearest_stamps"]

@@ -33,7 +33,7 @@ from deltas_nets.captures.readers.names import (
     without_common_folder,
 )
 from deltas_nets.captures.readers.ply import read_points
-from deltas_nets.captures.readers.scannet import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import world_from_cam_inverse
 from deltas_nets.captures.readers.transforms_cameras import StatedCamera, stated_camera
 from deltas_nets.captures.readers.units import is_metric
 from deltas_nets.errors import UserError
@@ -141,7 +141,7 @@ def _image_folders(folder: Path) -> list[Path]:
 def _entries(file: Path) -> list[_Entry]:
     """All frames of a file, images not looked for; ScanNet++ lists those kept for tests apart."""
     root = Fields(
-        read_json(file, name="transforms", remedy=REMEDY), file, where="it", remedy=REMEDY
+        read_json(file, name="transforms", remedy=REMEDY), file, where="the file", remedy=REMEDY
     )
     if not root.items("frames"):
         raise root.error("has no frames")

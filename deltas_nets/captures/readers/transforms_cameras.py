@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deltas_nets.captures.frame import FloatArray, Lens
+from deltas_nets.captures.readers.cameras import size_of
 from deltas_nets.captures.readers.json_file import Fields
 
 __all__ = ["INTRINSICS", "StatedCamera", "stated_camera"]
@@ -66,7 +67,8 @@ def stated_camera(root: Fields, frame: Fields) -> StatedCamera:
     lens = _lens(both)
     focal, of_angles = _focal(frame, both, lens)
     centre = (both.number("cx"), both.number("cy")) if "cx" in both and "cy" in both else None
-    return StatedCamera(focal, of_angles, centre, lens, _size(both))
+    size = size_of(both, "h", "w") if "h" in both and "w" in both else None
+    return StatedCamera(focal, of_angles, centre, lens, size)
 
 
 def _focal(frame: Fields, both: Fields, lens: Lens | None) -> tuple[tuple[float, float], bool]:
@@ -124,12 +126,3 @@ def _coefficients(both: Fields) -> list[float]:
         what = f"has distortion_params of {len(listed)} numbers, not {' '.join(COEFFICIENTS)}"
         raise both.error(what, "distortion_params")
     return list(listed)
-
-
-def _size(both: Fields) -> tuple[int, int] | None:
-    if "w" not in both or "h" not in both:
-        return None
-    height, width = both.number("h"), both.number("w")
-    if not all(1 <= side < 2**20 and side == int(side) for side in (height, width)):
-        raise both.error(f"has a size of {width:g} x {height:g} pixels", "w")
-    return int(height), int(width)

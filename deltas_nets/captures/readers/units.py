@@ -32,7 +32,7 @@ def is_metric(root: Fields) -> bool:
         metres, unknown = _as_said(root, "metres"), _as_said(root, "unknown")
         remedy = f"multiply translations by {length:g} and say {metres}, or say {unknown} "
         remedy += f"and add --scale {length:g}"
-        raise UserError(f"its units are {units}, not metres", root.path, remedy)
+        raise UserError(f"the file's units are {units}, not metres", root.path, remedy)
     return units.lower() in METRES
 
 
