@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.commands.depth_options import asked_options, fitting_options
+from deltas_nets.commands.depth_options import asked_options, fitting_options, look_first
 from deltas_nets.commands.depth_telling import show, tell
 from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for, usable_device
 from deltas_nets.commands.fuse import fuse_maps
@@ -107,15 +107,8 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.captures.companions import companions
         from deltas_nets.captures.keyframes import keyframes
         from deltas_nets.captures.usable import check_all, lone_frames, usable_view_sets, warn_of
-        from deltas_nets.captures.working_depth import knows_its_scale
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
         from deltas_nets.predict.capture import predict_capture
-        from deltas_nets.predict.first_look import (
-            ANCHORS,
-            ROUNDS,
-            depth_seen,
-            elsewhere_than_in_rooms,
-        )
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
@@ -126,12 +119,8 @@ class Depth(Captured, Measuring, Prediction):
             predictor.check_measured()
         capture = self.in_metres(capture, predictor, config)
         depth = None
-        if not knows_its_scale(capture) and not (capture.metric and self.views == 1):
-            # Then a few maps tell, before views are chosen.
-            threads = self._threads(ANCHORS)
-            with progress("first look", ROUNDS * ANCHORS) as report:
-                depth = depth_seen(predictor, capture, config, threads=threads, report=report)
-            depth = elsewhere_than_in_rooms(depth, capture)
+        if self.views != 1 or not capture.metric:  # nothing is searched, and no unit to be found
+            depth = look_first(predictor, capture, config, self._at_once)
         few = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
             found = lone_frames(capture, self.view_sets, few)
@@ -223,16 +212,20 @@ class Depth(Captured, Measuring, Prediction):
         return found
 
     def _threads(self, maps: int) -> int:
+        """Maps at once of those that are written."""
+        count = self._at_once(maps)
+        if self.workers is None and count > 1:
+            print(f"{count} maps at a time, a core each (--workers)")
+        return count
+
+    def _at_once(self, maps: int) -> int:
         """Maps at once: a core each, as cores that share a map wait for each other."""
         from deltas_nets.predict.capture import FEWEST
 
         if self.workers is not None or usable_device(self.device) != "cpu" or maps < FEWEST:
             return self.workers or 1
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        count = min(cores or 1, maps)
-        if count > 1:
-            print(f"{count} maps at a time, a core each (--workers)")
-        return count
+        return min(cores or 1, maps)
 
     def _folder(
         self,

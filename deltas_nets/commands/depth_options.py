@@ -1,14 +1,18 @@
-"""What `deltas depth` writes, in which unit and in which steps."""
+"""What `deltas depth` knows before it starts: how far surfaces are, in which steps it writes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from deltas_nets.commands.flags import sensible
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import progress
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
     from deltas_nets.outputs.products import OutputOptions
+    from deltas_nets.predict.depth_map import PredictConfig
+    from deltas_nets.predict.predictor import Predictor
 
 
 def asked_options(
@@ -61,3 +65,24 @@ def fitting_options(
             return replace(options, depth_scale=steps_to(max(far, 4 * usual)))
     check_depth_fits((0.0, far), options)
     return options
+
+
+def look_first(
+    predictor: "Predictor",
+    capture: "Capture",
+    config: "PredictConfig",
+    at_once: Callable[[int], int],
+) -> float | None:
+    """How far surfaces are, by a few maps; None where the capture says so or is of a usual room.
+
+    Args:
+        predictor: of a trained network.
+        capture: the frames.
+        config: all but the range.
+        at_once: of how many maps so many are computed at once.
+    """
+    from deltas_nets.predict.first_look import ANCHORS, ROUNDS, depth_unlike_rooms
+
+    threads = at_once(ANCHORS)
+    with progress("first look", ROUNDS * ANCHORS) as report:
+        return depth_unlike_rooms(predictor, capture, config, threads=threads, report=report)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,14 +21,19 @@ from deltas_nets.errors import UserError
 from deltas_nets.network.unit import AS_IN_ROOMS
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.look import found_depths
+from deltas_nets.predict.passes import SMALL
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.search import Followed
 from deltas_nets.terminal import warn
 
-__all__ = ["depth_seen", "elsewhere_than_in_rooms", "scale_by_measurements", "scale_by_sensor"]
+__all__ = ["depth_seen", "depth_unlike_rooms", "scale_by_measurements", "scale_by_sensor"]
 
 ANCHORS = 5
 """Frames that are looked at."""
+ENOUGH_FOR_ROOMS = 2
+"""Of these one is enough to take a capture in metres for a room."""
+SURE = 0.3
+"""Mean confidence; usual is 0.5."""
 ROUNDS = 3
 """At most, until views chosen for a depth find that depth."""
 AGREES = 1.4
@@ -47,8 +53,6 @@ def depth_seen(
 ) -> float:
     """How far typical surfaces are, in the capture's unit: as it knows, or as a first look finds.
 
-    A metre tells nothing of that: captures in metres are of a desk, a room or a street.
-
     Args:
         predictor: of a trained network.
         capture: the frames.
@@ -61,16 +65,10 @@ def depth_seen(
     """
     if knows_its_scale(capture):
         return float(np.median(working_depths(capture)))
-    search, depth = Followed(replace(capture, metric=False)), guessed_depth(capture)
-
-    def look(views: ViewSet) -> FloatArray:
-        depths = found_depths(search(predictor, views, config).map)
-        report(views.anchor)
-        return depths
-
+    depth = guessed_depth(capture)
     for _ in range(ROUNDS):
-        found = side_by_side(look, _some(capture, working_depth=depth), threads)
-        medians = [float(np.median(depths)) for depths in found if len(depths)]
+        looks = _looks(predictor, capture, config, depth, ANCHORS, threads=threads, report=report)
+        medians = [look.depth for look in looks if look.depth > 0]
         if not medians:
             break
         before, depth = depth, float(np.median(medians))
@@ -79,10 +77,96 @@ def depth_seen(
     return depth
 
 
-def elsewhere_than_in_rooms(depth: float, capture: Capture) -> float | None:
-    """The depth that was seen, or None where the capture knows better or is of a usual room."""
-    as_in_rooms = capture.metric and AS_IN_ROOMS[0] <= depth <= AS_IN_ROOMS[1]
-    return None if as_in_rooms or knows_its_scale(capture) else depth
+def depth_unlike_rooms(
+    predictor: Predictor,
+    capture: Capture,
+    config: PredictConfig,
+    *,
+    threads: int = 1,
+    report: Callable[[str], None] = lambda _: None,
+) -> float | None:
+    """How far typical surfaces are, where nothing states it and they are not as far as in rooms.
+
+    A metre tells nothing of that: captures in metres are of a desk, a room or a street. Such a one
+    is of a room unless a network that knows how sure it is sees otherwise in all it looks at.
+
+    Args:
+        predictor: of a trained network.
+        capture: the frames.
+        config: all but the range.
+        threads: maps computed at once.
+        report: as of :func:`depth_seen`.
+
+    Returns:
+        In the capture's unit; None where that is stated, or as in rooms.
+
+    Raises:
+        UserError: an image cannot be read, or there are fewer than two frames.
+    """
+    if knows_its_scale(capture) or (capture.metric and not predictor.states_confidence):
+        return None
+    if capture.metric and not _surely_unlike(predictor, capture, config, threads):
+        return None
+    depth = depth_seen(predictor, capture, config, threads=threads, report=report)
+    return None if capture.metric and _as_in_rooms(depth) else depth
+
+
+def _surely_unlike(
+    predictor: Predictor, capture: Capture, config: PredictConfig, threads: int
+) -> bool:
+    """Whether two looks, at views that suit what they find, both see no room, and surely."""
+    depth = guessed_depth(capture)
+    for _ in range(ROUNDS):
+        looks = _looks(predictor, capture, config, depth, ENOUGH_FOR_ROOMS, threads=threads)
+        if any(look.depth == 0 or _as_in_rooms(look.depth) for look in looks):
+            return False
+        if all(look.sure >= SURE for look in looks):
+            return True
+        depth = float(np.median([look.depth for look in looks]))
+    return False
+
+
+def _as_in_rooms(depth: float) -> bool:
+    return AS_IN_ROOMS[0] <= depth <= AS_IN_ROOMS[1]
+
+
+class _Look(NamedTuple):
+    """What a map tells.
+
+    Attributes:
+        depth: the median of its points, in the capture's unit; 0 if there are none.
+        sure: its mean confidence; 0 if the network states none.
+    """
+
+    depth: float
+    sure: float
+
+
+def _looks(
+    predictor: Predictor,
+    capture: Capture,
+    config: PredictConfig,
+    depth: float,
+    count: int,
+    *,
+    threads: int,
+    report: Callable[[str], None] = lambda _: None,
+) -> list[_Look]:
+    """Maps of a few frames, with views for surfaces at a depth, whatever the unit."""
+    search, config = Followed(replace(capture, metric=False)), replace(config, size=SMALL)
+
+    def look(views: ViewSet) -> _Look:
+        map = search(predictor, views, config).map
+        depths = found_depths(map)
+        report(views.anchor)
+        return _Look(
+            float(np.median(depths)) if len(depths) else 0.0,
+            0.0 if map.confidence is None else float(map.confidence.mean()),
+        )
+
+    anchors = spread(list(capture.frames), count)
+    some = choose_view_sets(capture, 3, working_depth=depth, anchors=anchors)
+    return list(side_by_side(look, some, threads))
 
 
 def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfig) -> float:
@@ -105,7 +189,7 @@ def scale_by_sensor(predictor: Predictor, capture: Capture, config: PredictConfi
         ratios += _ratios_at_points(capture, position[id]).tolist()
     if len(ratios) < ENOUGH:
         search, config = Followed(capture), _whole(config)
-        for views in _some(capture, anchors=spread(with_sensor, ANCHORS)):
+        for views in _some(capture, spread(with_sensor, ANCHORS)):
             depth = search(predictor, views, config).map.depth
             measured = depth_at_image(capture.frame(views.anchor))
             both = (depth > 0) & (measured > 0)
@@ -133,7 +217,7 @@ def scale_by_measurements(
     """
     search, config, ratios = Followed(capture), _whole(config), []
     for id, rows in measured_by_hand(file, capture).items():
-        (views,) = _some(capture, anchors=[id])
+        (views,) = _some(capture, [id])
         depth = search(predictor, views, config).map.depth
         for x, y, metres in rows:
             found = float(depth[round(y), round(x)])
@@ -173,8 +257,5 @@ def _ratios_at_points(capture: Capture, position: int) -> FloatArray:
     return ratios
 
 
-def _some(
-    capture: Capture, *, working_depth: float | None = None, anchors: Sequence[str] | None = None
-) -> tuple[ViewSet, ...]:
-    chosen = spread(list(capture.frames), ANCHORS) if anchors is None else anchors
-    return choose_view_sets(capture, 3, working_depth=working_depth, anchors=chosen)
+def _some(capture: Capture, anchors: Sequence[str]) -> tuple[ViewSet, ...]:
+    return choose_view_sets(capture, 3, anchors=anchors)
