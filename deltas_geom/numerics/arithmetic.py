@@ -1,6 +1,7 @@
 """The precision that arguments are worked on in, and numbers that are none."""
 
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial, reduce, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -119,10 +120,9 @@ def _called(
 ) -> Callable[_Arguments, _Result]:
     @wraps(operation)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        # Asked first: an exported program that holds a region without autocast cannot be loaded.
         if torch.compiler.is_compiling() or torch._C._is_any_autocast_enabled():
             kind = next((x.device.type for x in tensors_of((*args, *kwargs.values()))), "meta")
-            if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
+            if autocasts(kind):
                 with torch.autocast(kind, enabled=False):
                     return called(*args, **kwargs)
         if not (_any_half(args) or _any_half(kwargs.values())):
@@ -136,6 +136,20 @@ def _called(
         return mapped(partial(_rounded, dtype=dtype), result, "covariance") if half else result
 
     return called
+
+
+def autocasts(kind: str) -> bool:
+    """Whether ``torch.autocast`` is on for a kind of device.
+
+    It is turned off only where it is on: an exported program that holds a region without autocast
+    cannot be loaded, and is traced in pieces, which takes twice as long.
+    """
+    return torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
+
+
+def outside_autocast(kind: str) -> AbstractContextManager[object]:
+    """A region without ``torch.autocast``."""
+    return torch.autocast(kind, enabled=False) if autocasts(kind) else nullcontext()
 
 
 def _any_half(values: Iterable[Any]) -> bool:

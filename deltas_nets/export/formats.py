@@ -200,12 +200,9 @@ class OnnxRunner:
 def program_bytes(program: ExportedProgram, metadata: Mapping[str, str]) -> bytes:
     """A file for ``torch.export.load`` of a traced network."""
     with _quiet():
-        # No operation is replaced; it makes functions of operations that write in place, and
-        # dissolves what is marked as exempt from autocast, which cannot be loaded again.
-        whole = without_paths(program.run_decompositions({}))
         file = io.BytesIO()
         extra = {METADATA_FILE: json.dumps(metadata)}
-        torch.export.save(whole, file, extra_files=extra)
+        torch.export.save(without_paths(program), file, extra_files=extra)
     return file.getvalue()
 
 

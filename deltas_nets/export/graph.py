@@ -14,6 +14,7 @@ from torch.export import ExportedProgram
 
 from deltas_geom import PosedViews
 from deltas_geom.checks import check_depth_range
+from deltas_geom.numerics.arithmetic import outside_autocast
 from deltas_nets.network.deltas import Deltas
 
 INPUTS = ("images", "K", "cam_from_world")
@@ -112,7 +113,8 @@ def trace(model: Deltas, config: ExportConfig) -> ExportedProgram:
         torch.eye(3, device=device).repeat(1, views, 1, 1),
         torch.eye(4, device=device).repeat(1, views, 1, 1),
     )
-    with torch.no_grad():
+    # A region within the program that is exempt from autocast could not be loaded again.
+    with outside_autocast(device.type), torch.no_grad():
         return torch.export.export(FixedDeltas(model, config).eval(), inputs)
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews, SparseDepth, rasterize_depth, triangulate
+from deltas_geom.numerics.arithmetic import outside_autocast
 from deltas_nets.config import NetworkConfig
 from deltas_nets.network.batch import flat_batch, with_batch_dims
 from deltas_nets.network.build import build_stages
@@ -163,7 +164,7 @@ class Deltas(nn.Module):
             features, image_size=image_size, num_keypoints=num_keypoints, shift=shift
         )
         # Geometry keeps full precision whatever the network around it runs in.
-        with torch.autocast(views.K.device.type, enabled=False):
+        with outside_autocast(views.K.device.type):
             matched = self.matcher(
                 keypoints.pixels,
                 descriptors,

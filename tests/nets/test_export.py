@@ -70,7 +70,9 @@ def content_of(form: str, model: Deltas, config: ExportConfig, folder: Path) -> 
     file = folder / f"{config.num_views}.{form}"
     with FileLock(f"{file}.lock"):
         if not file.exists():
-            graph, metadata = trace(model, config), metadata_of(model, config, {"step": "7"})
+            # Whatever the caller does: a program that holds traces of autocast cannot be loaded.
+            with torch.autocast("cpu", enabled=config.num_views == 3):
+                graph, metadata = trace(model, config), metadata_of(model, config, {"step": "7"})
             made = (
                 onnx_bytes(graph, metadata, Path("x.onnx"))
                 if form == "onnx"

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import Matches, PosedViews, SparseDepth, Triangulation
+from deltas_geom.numerics.arithmetic import outside_autocast
 from deltas_nets.config import NetworkConfig
 from deltas_nets.config.encoders import ENCODERS
 from deltas_nets.config.lookup import look_up
@@ -102,7 +103,7 @@ class CostVolume(nn.Module):
         near_origin, _ = moved_to_anchor(views, torch.promote_types(self.dtype, torch.float32))
         inv_depths = bin_centres(self.config.matcher.num_samples, depth_range, like=near_origin.K)
         # Geometry keeps full precision whatever the network around it runs in.
-        with torch.autocast(images.device.type, enabled=False):
+        with outside_autocast(images.device.type):
             difference = difference_volume(compared, near_origin, inv_depths, image_size=size)
         dense = self.decoder(features.of_anchor(), Planes(difference, inv_depths), size)
         depth = dense.log_depth[0].exp()
