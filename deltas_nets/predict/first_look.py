@@ -67,7 +67,8 @@ def depth_seen(
         return float(np.median(working_depths(capture)))
     depth = guessed_depth(capture)
     for _ in range(ROUNDS):
-        looks = _looks(predictor, capture, config, depth, ANCHORS, threads=threads, report=report)
+        anchors = spread(list(capture.frames), ANCHORS)
+        looks = _looks(predictor, capture, config, depth, anchors, threads=threads, report=report)
         medians = [look.depth for look in looks if look.depth > 0]
         if not medians:
             break
@@ -105,21 +106,21 @@ def depth_unlike_rooms(
     """
     if knows_its_scale(capture) or (capture.metric and not predictor.states_confidence):
         return None
-    if capture.metric and not _surely_unlike(predictor, capture, config, threads):
+    if capture.metric and not _surely_unlike(predictor, capture, config):
         return None
     depth = depth_seen(predictor, capture, config, threads=threads, report=report)
     return None if capture.metric and _as_in_rooms(depth) else depth
 
 
-def _surely_unlike(
-    predictor: Predictor, capture: Capture, config: PredictConfig, threads: int
-) -> bool:
+def _surely_unlike(predictor: Predictor, capture: Capture, config: PredictConfig) -> bool:
     """Whether two looks, at views that suit what they find, both see no room, and surely."""
     depth = guessed_depth(capture)
     for _ in range(ROUNDS):
-        looks = _looks(predictor, capture, config, depth, ENOUGH_FOR_ROOMS, threads=threads)
-        if any(look.depth == 0 or _as_in_rooms(look.depth) for look in looks):
-            return False
+        looks = []
+        for anchor in spread(list(capture.frames), ENOUGH_FOR_ROOMS):
+            looks += _looks(predictor, capture, config, depth, [anchor])
+            if looks[-1].depth == 0 or _as_in_rooms(looks[-1].depth):
+                return False
         if all(look.sure >= SURE for look in looks):
             return True
         depth = float(np.median([look.depth for look in looks]))
@@ -147,9 +148,9 @@ def _looks(
     capture: Capture,
     config: PredictConfig,
     depth: float,
-    count: int,
+    anchors: Sequence[str],
     *,
-    threads: int,
+    threads: int = 1,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[_Look]:
     """Maps of a few frames, with views for surfaces at a depth, whatever the unit."""
@@ -164,7 +165,6 @@ def _looks(
             0.0 if map.confidence is None else float(map.confidence.mean()),
         )
 
-    anchors = spread(list(capture.frames), count)
     some = choose_view_sets(capture, 3, working_depth=depth, anchors=anchors)
     return list(side_by_side(look, some, threads))
 
