@@ -227,3 +227,10 @@ def test_no_recipe_trains_on_rooms_that_are_held_out_or_on_a_part_s_rooms_again(
         ]
         assert all(rooms.start >= 1000 for rooms in used)  # the seeds below are held out
         assert all(a.stop <= b.start for a, b in pairwise(used))
+
+
+def test_a_recipe_begins_in_no_folder_of_other_things(tmp_path: Path) -> None:
+    (tmp_path / "color").mkdir()
+    with pytest.raises(UserError, match="holds something else"):
+        begin(tmp_path, Beginning("night", 1.0, None, None))
+    assert [file.name for file in tmp_path.iterdir()] == ["color"]
