@@ -81,8 +81,17 @@ def look_first(
         config: all but the range.
         at_once: of how many maps so many are computed at once.
     """
-    from deltas_nets.predict.first_look import ANCHORS, ROUNDS, depth_unlike_rooms
+    from deltas_nets.captures.working_depth import knows_its_scale
+    from deltas_nets.predict.first_look import (
+        ANCHORS,
+        ENOUGH_FOR_ROOMS,
+        ROUNDS,
+        depth_unlike_rooms,
+    )
 
+    if knows_its_scale(capture):  # no bar for what takes no time
+        return None
     threads = at_once(ANCHORS)
-    with progress("first look", ROUNDS * ANCHORS) as report:
+    looks = ANCHORS + (ENOUGH_FOR_ROOMS if capture.metric else 0)
+    with progress("first look", ROUNDS * looks) as report:
         return depth_unlike_rooms(predictor, capture, config, threads=threads, report=report)

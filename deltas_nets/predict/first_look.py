@@ -96,7 +96,7 @@ def depth_unlike_rooms(
         capture: the frames.
         config: all but the range.
         threads: maps computed at once.
-        report: as of :func:`depth_seen`.
+        report: called with the id of every frame that was looked at.
 
     Returns:
         In the capture's unit; None where that is stated, or as in rooms.
@@ -106,19 +106,21 @@ def depth_unlike_rooms(
     """
     if knows_its_scale(capture) or (capture.metric and not predictor.states_confidence):
         return None
-    if capture.metric and not _surely_unlike(predictor, capture, config):
+    if capture.metric and not _surely_unlike(predictor, capture, config, report):
         return None
     depth = depth_seen(predictor, capture, config, threads=threads, report=report)
     return None if capture.metric and _as_in_rooms(depth) else depth
 
 
-def _surely_unlike(predictor: Predictor, capture: Capture, config: PredictConfig) -> bool:
+def _surely_unlike(
+    predictor: Predictor, capture: Capture, config: PredictConfig, report: Callable[[str], None]
+) -> bool:
     """Whether two looks, at views that suit what they find, both see no room, and surely."""
     depth = guessed_depth(capture)
     for _ in range(ROUNDS):
         looks = []
         for anchor in spread(list(capture.frames), ENOUGH_FOR_ROOMS):
-            looks += _looks(predictor, capture, config, depth, [anchor])
+            looks += _looks(predictor, capture, config, depth, [anchor], report=report)
             if looks[-1].depth == 0 or _as_in_rooms(looks[-1].depth):
                 return False
         if all(look.sure >= SURE for look in looks):
