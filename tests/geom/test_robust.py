@@ -20,6 +20,7 @@ from deltas_geom import (
 )
 from deltas_geom.testing import PosedScene, ring, scene_from
 from deltas_geom.testing.fixed_scenes import seeded_scene
+from deltas_geom.triangulation import robust
 
 
 def seen(inputs: Inputs) -> tuple[Tensor, Tensor, Tensor]:
@@ -213,8 +214,14 @@ def in_a_row(num_views: int, num_points: int) -> tuple[PosedScene, Tensor]:
     return scene, wrong
 
 
-@pytest.mark.parametrize("num_views", [4, 5, 10, 11])
-def test_of_eleven_views_any_two_that_agree_are_found(num_views: int) -> None:
+@pytest.mark.parametrize(
+    ("num_views", "budget"), [(4, None), (5, None), (10, None), (11, None), (5, 1)]
+)
+def test_of_eleven_views_any_two_that_agree_are_found(
+    num_views: int, budget: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if budget is not None:  # one candidate of one point at a time
+        monkeypatch.setattr(robust, "_BUDGET", budget)
     pairs = torch.combinations(torch.arange(num_views))
     scene, wrong = in_a_row(num_views, len(pairs))
     agree = (torch.arange(num_views)[:, None, None] == pairs).any(dim=-1)

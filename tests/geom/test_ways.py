@@ -181,6 +181,11 @@ def test_products_in_blocks_are_products(
     assert_close(sums.over_points(c, b), c @ b.mT)
     assert_close(sums.over_points(c[0], b), c[0] @ b.mT)
     assert_close(torch.stack(sums.over_views(a, b), dim=-2), a @ b)
+    assert_close(torch.stack(sums.over_views(a, *b.split([1, 2], dim=-2)), dim=-2), a @ b)
+    with monkeypatch.context() as compiled:
+        compiled.setattr(torch.compiler, "is_compiling", lambda: True)
+        in_parts = sums.over_views(a, *b.split([1, 2], dim=-2))
+    assert_close(torch.stack(in_parts, dim=-2), a @ b)
     assert_close(sums.product(a[:0], b[:0]), a[:0] @ b[:0])
     assert_close(sums.product(a[..., :0], b[..., :0, :]), a[..., :0] @ b[..., :0, :])
     leaves = [x.clone().requires_grad_() for x in (a, b, c)]
