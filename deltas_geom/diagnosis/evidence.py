@@ -85,7 +85,7 @@ def choose_pairs(seen: Tensor) -> Tensor:
 
 
 def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHARE) -> Tensor:
-    """Distance in px that a quarter of a pair's matches keep within, ``(P)``.
+    """Distance in px that a quarter of a pair's matches keep within, ``(*B, P)``.
 
     A match is as far off as its pixel in one view is from what that view sees of the other
     pixel's ray: a half line, from the ray's far end to the epipole. So a point behind a camera
@@ -93,18 +93,19 @@ def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHA
 
     Args:
         evidence: of P pairs.
-        K: ``(V, 3, 3)`` any invertible matrices, as they may be transposed.
-        pose: ``(V, 4, 4)`` cam_from_world.
+        K: ``(*B, V, 3, 3)`` any invertible matrices, as they may be transposed.
+        pose: ``(*B, V, 4, 4)`` cam_from_world.
         share: of a pair's matches must be within the distance.
     """
     off = distances(evidence, K, pose)
     rank = ((evidence.counts * share).ceil().long() - 1).clamp(min=0)
-    return off.sort(dim=-1).values.gather(-1, rank[:, None])[:, 0].clamp(max=CAP)
+    nearest = off.sort(dim=-1).values
+    return nearest.gather(-1, rank[:, None].expand(*off.shape[:-1], 1))[..., 0].clamp(max=CAP)
 
 
 def distances(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
-    """``(P, M)`` px, how far off each match is, in the worse of the pair's views."""
-    return torch.maximum(*_off(evidence, K, pose).chunk(2))
+    """``(*B, P, M)`` px, how far off each match is, in the worse of the pair's views."""
+    return torch.maximum(*_off(evidence, K, pose).chunk(2, dim=-2))
 
 
 def displacements(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
@@ -115,24 +116,25 @@ def displacements(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
 
 
 def _off(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
-    """``(2 P, M)`` px of the second views' pixels from the first's rays, and the other way."""
+    """``(*B, 2 P, M)`` px of second views' pixels from the first's rays, and the other way."""
     pairs = torch.cat([evidence.pairs, evidence.pairs.flip(-1)])
     pixels, others = (
         torch.cat(both)
         for both in ((evidence.first, evidence.second), (evidence.second, evidence.first))
     )
     a, b = pairs.unbind(dim=-1)
-    rotation, translation = pose[:, :3, :3], pose[:, :3, 3:]
-    turn = rotation[b] @ rotation[a].mT
-    baseline = translation[b] - turn @ translation[a]
-    infinite = (K[b] @ turn @ inverse_up_to_scale(K)[a])[..., None]
+    from_a, from_b = pose[..., a, :3, :], pose[..., b, :3, :]
+    turn = from_b[..., :3] @ from_a[..., :3].mT
+    baseline = from_b[..., 3:] - turn @ from_a[..., 3:]
+    to_b = K[..., b, :, :]
+    infinite = (to_b @ turn @ inverse_up_to_scale(K)[..., a, :, :])[..., None]
     # By components: small matrix products and reductions over dims of two are slow.
     px, py = pixels.unbind(dim=-1)
     fx, fy, fz = (
-        infinite[:, row, 0] * px + infinite[:, row, 1] * py + infinite[:, row, 2]
+        infinite[..., row, 0, :] * px + infinite[..., row, 1, :] * py + infinite[..., row, 2, :]
         for row in range(3)
     )
-    nx, ny, nz = (K[b] @ baseline).unbind(dim=-2)  # the epipole, (2 P, 1) each
+    nx, ny, nz = (to_b @ baseline).unbind(dim=-2)  # the epipole, (*B, 2 P, 1) each
     far_ahead, near_ahead = fz > 0, nz > 0
     # From behind the view, the ray comes from infinity and ends in the epipole.
     sign = torch.where(far_ahead, 1.0, -1.0).to(fz)
@@ -153,12 +155,12 @@ def _off(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
 
 
 def inverse_up_to_scale(K: Tensor) -> Tensor:
-    """``(V, 3, 3)`` a positive multiple of the inverse of any K, finite even where it has none.
+    """``(*B, V, 3, 3)`` a positive multiple of the inverse of any K, finite even where it has none.
 
     A solver's overhead is more than all else here.
     """
     x, y, z = K.unbind(dim=-2)
     columns = [torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)]
     sign = (x * columns[0]).sum(dim=-1).sign()
-    inverse: Tensor = torch.stack(columns, dim=-1) * sign[:, None, None]
+    inverse: Tensor = torch.stack(columns, dim=-1) * sign[..., None, None]
     return inverse

@@ -1,7 +1,7 @@
 """Cameras as they should have been, if a cause were the one."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -18,6 +18,7 @@ _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], device="cpu").double())
 _SWAP = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]], device="cpu").double()
 _SIZES = sorted({*COMMON_SIZES, *(2 ** (step / 8) for step in range(-16, 17) if step)})
 _FINEST = 1e-4  # relative, of factors that are searched
+_MATCHES_AT_ONCE = 30_000  # of all cameras tried together: 1 MB a tensor of both directions
 
 
 class Hypothesis(NamedTuple):
@@ -38,7 +39,8 @@ class Hypothesis(NamedTuple):
     pose: Tensor
 
 
-Mend = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+Cameras = tuple[Tensor, Tensor]  # K and cam_from_world
+Mend = Callable[[Tensor, Tensor], Cameras]
 
 MENDS: dict[Cause, Mend] = {
     Cause.POSES_INVERTED: lambda K, pose: (K, invert_pose(pose)),
@@ -126,11 +128,10 @@ def best_size(
 ) -> float:
     """Factor of the chosen cameras' K, or of their focal lengths, with the least residuals."""
 
-    def cost(factor: float) -> float:
-        changed = replaced(K, pose, chosen, by(K[chosen], factor), pose[chosen])
-        return float(residuals(evidence, *changed).mean())
+    def cameras(factor: float) -> Cameras:
+        return replaced(K, pose, chosen, by(K[chosen], factor), pose[chosen])
 
-    return _searched(cost, _SIZES, COMMON_SIZES, step=2 ** (1 / 8))
+    return _searched(cameras, evidence, _SIZES, COMMON_SIZES, step=2 ** (1 / 8))
 
 
 def best_unit(K: Tensor, pose: Tensor, evidence: Evidence, camera: int) -> float:
@@ -139,8 +140,8 @@ def best_unit(K: Tensor, pose: Tensor, evidence: Evidence, camera: int) -> float
     x1^T F x0 = 0 is linear in it: every match votes, the more the longer its epipolar line moves.
     """
 
-    def cost(factor: float) -> float:
-        return float(residuals(evidence, K, with_unit(pose, camera, factor)).mean())
+    def cameras(factor: float) -> Cameras:
+        return K, with_unit(pose, camera, factor)
 
     without, once = (_epipolar(evidence, K, with_unit(pose, camera, unit)) for unit in (0.0, 1.0))
     change = once - without
@@ -154,7 +155,7 @@ def best_unit(K: Tensor, pose: Tensor, evidence: Evidence, camera: int) -> float
             *(v[g] for v, g in zip(votes, good, strict=True) if bool(g.any())),
         ):
             starts.append(float(some.median()))
-    return _searched(cost, starts, COMMON_UNITS, step=1.2)
+    return _searched(cameras, evidence, starts, COMMON_UNITS, step=1.2)
 
 
 def with_unit(pose: Tensor, camera: int, unit: float) -> Tensor:
@@ -166,14 +167,12 @@ def with_unit(pose: Tensor, camera: int, unit: float) -> Tensor:
 
 def cropped(K: Tensor, pose: Tensor, evidence: Evidence) -> Hypothesis:
     """The shift of all centres with the least residuals, by steps to the eight sides."""
-
-    def cost(place: Tensor) -> float:
-        return float(residuals(evidence, shifted(K, place), pose).mean())
-
     best, step = K.new_zeros(2), 64.0
     ways = torch.cartesian_prod(*[K.new_tensor([0.0, -1, 1])] * 2)
     while step > 0.01:
-        nearest = min(best + step * ways, key=cost)
+        places = best + step * ways
+        left = _left(evidence, [(shifted(K, place), pose) for place in places])
+        nearest = places[left.index(min(left))]
         step = step / 2 if torch.equal(nearest, best) else step
         best = nearest
     return Hypothesis(Cause.CROPPED, (), None, shifted(K, best), pose)
@@ -186,9 +185,7 @@ def shifted(K: Tensor, shift: float | Tensor) -> Tensor:
     return moved
 
 
-def replaced(
-    K: Tensor, pose: Tensor, chosen: slice, new_K: Tensor, new_pose: Tensor
-) -> tuple[Tensor, Tensor]:
+def replaced(K: Tensor, pose: Tensor, chosen: slice, new_K: Tensor, new_pose: Tensor) -> Cameras:
     """All cameras with the chosen ones replaced."""
     K, pose = K.clone(), pose.clone()
     K[chosen], pose[chosen] = new_K, new_pose
@@ -196,26 +193,44 @@ def replaced(
 
 
 def _searched(
-    cost: Callable[[float], float], starts: list[float], common: tuple[float, ...], step: float
+    cameras: Callable[[float], Cameras],
+    evidence: Evidence,
+    starts: list[float],
+    common: tuple[float, ...],
+    step: float,
 ) -> float:
-    """The factor of least cost, first among ``starts``, then around the best two of them."""
-    ranked = sorted((cost(factor), factor) for factor in starts)
-    least, best = ranked[0]
-    for value, center in ranked[:2]:
-        width = math.log(step)
-        while width > _FINEST:
-            width *= 0.5
-            for factor in (center * math.exp(-width), center * math.exp(width)):
-                found = cost(factor)
-                if found < value:
-                    value, center = found, factor
-        if value < least:
-            least, best = value, center
+    """The factor that leaves least, first among ``starts``, then around the best two of them."""
+
+    def left(factors: Sequence[float]) -> list[float]:
+        return _left(evidence, [cameras(factor) for factor in factors])
+
+    ranked = sorted(zip(left(starts), starts, strict=True))
+    centers, width = ranked[:2], math.log(step)
+    while width > _FINEST:
+        width *= 0.5
+        beside = [factor * math.exp(side) for _, factor in centers for side in (-width, width)]
+        found = [*zip(left(beside), beside, strict=True)]
+        centers = [
+            min(center, *found[2 * place : 2 * place + 2], key=lambda each: each[0])
+            for place, center in enumerate(centers)
+        ]
+    least, best = min(centers, key=lambda each: each[0])
     # A round number, where it is as good.
-    for factor in common:
-        if abs(math.log(best / factor)) < 0.01 and cost(factor) <= 1.1 * least + 0.05:
-            return factor
-    return best
+    near = [factor for factor in common if abs(math.log(best / factor)) < 0.01]
+    as_good = (f for f, of in zip(near, left(near), strict=True) if of <= 1.1 * least + 0.05)
+    return next(as_good, best)
+
+
+def _left(evidence: Evidence, cameras: list[Cameras]) -> list[float]:
+    """Mean residual with each of several cameras, together: matches are few, and calls dear."""
+    at_once = max(1, _MATCHES_AT_ONCE // max(1, evidence.first[..., 0].numel()))
+    means: list[float] = []
+    for start in range(0, len(cameras), at_once):
+        K, pose = (
+            torch.stack(some) for some in zip(*cameras[start : start + at_once], strict=True)
+        )
+        means += residuals(evidence, K, pose).mean(dim=-1).tolist()
+    return means
 
 
 def _epipolar(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:
