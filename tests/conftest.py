@@ -1,6 +1,7 @@
 """What all tests share: hypothesis profiles, the dtypes, the real captures."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,10 @@ settings.register_profile(
     "thorough", settings.get_profile("same"), max_examples=1000, derandomize=False
 )
 settings.load_profile("same")
+# Without bytecode each process of tests, and each command that they start, would compile a thousand
+# files anew, for ten seconds and for one.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Test tensors are small: a second thread costs more than it brings.
 torch.set_num_threads(1)
 # Commands that tests start share the cores with the other processes that run tests.

@@ -11,6 +11,7 @@ from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
     only,
+    outside_gradients,
     promoted,
     unless_all,
     without_autocast,
@@ -97,7 +98,7 @@ def epipolar_lines(fundamental: Tensor, pixels: Tensor) -> Tensor:
     homogeneous = with_one(pixels)
     lines = homogeneous @ fundamental.mT
     size = lines[..., :2].detach().abs().amax(dim=-1, keepdim=True)
-    with torch.no_grad():
+    with outside_gradients():
         scale = homogeneous.abs() @ fundamental[..., :2, :].abs().mT
     noise = 16 * torch.finfo(lines.dtype).eps * scale.amax(dim=-1, keepdim=True)
     has_line = unless_all(only(size > noise, seen, known, other=False))

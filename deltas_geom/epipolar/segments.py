@@ -16,7 +16,15 @@ from deltas_geom.cameras.projection import rays_of_finite
 from deltas_geom.cameras.views import PosedViews, finite_views
 from deltas_geom.checks import batch_shape, check_depth_range, check_image_size, check_shapes
 from deltas_geom.epipolar.fundamental import inverse_intrinsics
-from deltas_geom.numerics.arithmetic import both, finite_or_zero, only, promoted, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    both,
+    finite_or_zero,
+    only,
+    outside_gradients,
+    promoted,
+    without_autocast,
+    without_gradients,
+)
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 
@@ -115,7 +123,7 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
     translation = source_from_anchor[..., :3, 3:]
     origin = rays @ (K_source @ source_from_anchor[..., :3, :3]).mT
     slope = (K_source @ translation).mT
-    with torch.no_grad():
+    with outside_gradients():
         share = torch.finfo(origin.dtype).eps ** _CLEARANCE
         clearance = share * rays.abs().amax(dim=-1)
         clearance_slope = share * translation.abs().amax(dim=-2)
@@ -230,7 +238,7 @@ def epipolar_segments(
     return Segments(start, end, low, high, status, foreshortening)
 
 
-@torch.no_grad()
+@without_gradients
 def _stands_still(rays: EpipolarRays) -> Tensor:
     """Whether pixels move with inverse depth by rounding alone, ``(*B, V-1, N)`` bool."""
     o, s, a, b = rays.origin, rays.slope, rays.terms, rays.slope_terms

@@ -4,7 +4,13 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.pixels import resize_pixels
-from deltas_geom.numerics.arithmetic import at_least_single, numbers_or_zero, only, unless_all
+from deltas_geom.numerics.arithmetic import (
+    at_least_single,
+    numbers_or_zero,
+    only,
+    outside_gradients,
+    unless_all,
+)
 
 
 def length_table(feature_map: Tensor) -> tuple[Tensor]:
@@ -47,7 +53,7 @@ def inverse_lengths(table: Tensor, pixels: Tensor, *, image_size: tuple[int, int
     of_x = torch.stack([1 - x, x, x * (x - 1)], dim=-2).unsqueeze(-3)
     of_y = torch.stack([1 - y, y, y * (y - 1)], dim=-2)
     squared = ((terms * of_x).sum(dim=-2) * of_y).sum(dim=-2)
-    with torch.no_grad():
+    with outside_gradients():
         ends = (terms[..., :2, :2, :] * of_x[..., :2, :]).sum(dim=-2) * of_y[..., :2, :]
         least = 16 * torch.finfo(squared.dtype).eps * ends.sum(dim=-2)
         has_length = unless_all(squared > least)

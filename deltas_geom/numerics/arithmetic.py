@@ -152,6 +152,22 @@ def outside_autocast(kind: str) -> AbstractContextManager[object]:
     return torch.autocast(kind, enabled=False) if autocasts(kind) else nullcontext()
 
 
+def outside_gradients() -> AbstractContextManager[object]:
+    """A region without gradients, and none where they are off: programs are traced in pieces."""
+    return torch.no_grad() if torch.is_grad_enabled() else nullcontext()
+
+
+def without_gradients(operation: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Compute :func:`outside_gradients`."""
+
+    @wraps(operation)
+    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with outside_gradients():
+            return operation(*args, **kwargs)
+
+    return called
+
+
 def _any_half(values: Iterable[Any]) -> bool:
     """Is any tensor in a nest of tuples of half precision? No list of them, which takes longer."""
     for value in values:

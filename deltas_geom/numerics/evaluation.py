@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from deltas_geom.checks import tracing
+from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_geom.numerics.chunks import Cut, chunks, joined
 
 Function = Callable[..., tuple[Tensor, ...]]
@@ -60,7 +61,7 @@ def recomputed(
     values = function if values is None else values
     compiling = torch.compiler.is_compiling()
     if not differentiated(*tensors):
-        with torch.no_grad():
+        with outside_gradients():
             return in_chunks(values, cut, *tensors)
     kind = _Traced if compiling else _Recomputed
     outputs: tuple[Tensor, ...] = kind.apply(function, values, cut, adjoint, *tensors)  # type: ignore[no-untyped-call]

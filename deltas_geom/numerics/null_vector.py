@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
+from deltas_geom.numerics.arithmetic import surely_all, values_at_hand, without_gradients
 from deltas_geom.numerics.ldl import (
     Factors,
     eliminate,
@@ -60,7 +60,7 @@ class NullVector(NamedTuple):
     simple: Tensor
 
 
-@torch.no_grad()
+@without_gradients
 def null_vector(
     matrix: Symmetric4,
     *,

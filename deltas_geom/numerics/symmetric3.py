@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_geom.numerics.vectors import Symmetric3, Vector3, less, scaled
 
 
@@ -18,7 +19,7 @@ def _factor3(normal: Symmetric3) -> tuple[tuple[Tensor, ...], Tensor]:
     much as the last row of L^-1 is long, squared, so that it does not matter which axis comes last.
     """
     a00, a01, a02, a11, a12, a22 = normal
-    with torch.no_grad():
+    with outside_gradients():
         least = 16 * torch.finfo(a00.dtype).eps * (a00 + a11 + a22)
         least = torch.where(least > 0, least, 1.0)
 
@@ -33,7 +34,7 @@ def _factor3(normal: Symmetric3) -> tuple[tuple[Tensor, ...], Tensor]:
     l21 = t21 * i1
     d2 = less(less(a22, l20, a02), l21, t21)
     i2, _ = reciprocal(d2)
-    with torch.no_grad():
+    with outside_gradients():
         n20 = less(l20, l10, l21)
         definite2 = d2 > least * (1 + l21.square() + n20.square())
     return (i0, i1, i2, l10, l20, l21), definite0 & definite1 & definite2
@@ -60,7 +61,7 @@ def solve3_scaled(normal: Symmetric3, right: Vector3) -> tuple[Vector3, Tensor]:
     A matrix whose trace is so large or small that squares of it leave the range of numbers
     counts as not definite.
     """
-    with torch.no_grad():
+    with outside_gradients():
         trace = normal[0] + normal[3] + normal[5]
         largest = torch.finfo(trace.dtype).max ** 0.45
         ordinary = (trace > 1 / largest) & (trace < largest)

@@ -16,6 +16,7 @@ from deltas_geom.checks import check_positive, check_tensor
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
     finite_or_zero,
+    outside_gradients,
     promoted,
     without_autocast,
 )
@@ -100,7 +101,7 @@ def triangulate_robust_rays(
         )
         return found.inliers.squeeze(-1).mT, found.status.squeeze(-1)
 
-    with torch.no_grad():
+    with outside_gradients():
         cut = Cut(_CHUNK, (-2, -1, -1), (-1, -1))
         inliers, reason = in_chunks(agreeing, cut, rays, weights, mask)
     points = triangulate_rays(cam_from_world, rays, weights, inliers, covariance=covariance)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.numerics.arithmetic import solver_dtype, surely_all
+from deltas_geom.numerics.arithmetic import outside_gradients, solver_dtype, surely_all
 from deltas_geom.numerics.vectors import Symmetric3, Vector3, dot, minus, scaled
 from deltas_geom.triangulation.observed import check_observed, finite_cameras
 from deltas_geom.triangulation.reprojection import mean_of, parallax_of
@@ -48,7 +48,7 @@ class Bearings(NamedTuple):
 
     def in_front(self, points: Vector3) -> Tensor:
         """Is each point ahead on all its used rays, by more than rounding? ``(*B, N)``."""
-        with torch.no_grad():
+        with outside_gradients():
             along = dot(self.directions, self.offsets(points))
             # At a camera's centre, within rounding, a point has no angle.
             size = _largest(in_world(points, self.datum)).unsqueeze(-2)
@@ -65,7 +65,7 @@ def see_rays(
     batch = check_observed(cam_from_world=cam_from_world, rays=rays, weights=weights, mask=mask)
     pose, broken = finite_cameras(cam_from_world[..., :3, :])  # whatever the last row
     x, y, z = (one.to(work, memory_format=torch.contiguous_format) for one in rays.unbind(dim=-1))
-    with torch.no_grad():
+    with outside_gradients():
         length = _largest((x, y, z))
         sound = (length > 0) & (length <= torch.finfo(work).max)
     # Double where throughout: what is not used must pass no gradient and no NaN.

@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
-from deltas_geom.numerics.arithmetic import only, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    only,
+    outside_gradients,
+    without_autocast,
+    without_gradients,
+)
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.symmetric3 import inverse3
 from deltas_geom.numerics.vectors import Vector3, dot, either, scaled
@@ -173,7 +178,7 @@ def _nearest(directions: Vector3, weight: Tensor, target: Vector3) -> tuple[Vect
     it is 0 within rounding x is 0, without gradient.
     """
     c00, c01, c02, c11, c12, c22 = inverse3(across_sums(weight, directions))
-    with torch.no_grad():
+    with outside_gradients():
         # The trace of an inverse is at most 3 by the smallest eigenvalue.
         total = (c00 + c11 + c22) * weight.sum(dim=-2)
         share = safe_divide(torch.ones_like(total), total, total > 0)
@@ -183,7 +188,7 @@ def _nearest(directions: Vector3, weight: Tensor, target: Vector3) -> tuple[Vect
     return tuple(dot(row, right) for row in rows), only(share, definite)
 
 
-@torch.no_grad()
+@without_gradients
 def _judge(seen: Bearings, points: Vector3, share: Tensor) -> Tensor:
     """Status ``(*B, N)`` int8 of the midpoints."""
     eps, least = torch.finfo(seen.dtype).eps, 64 * torch.finfo(share.dtype).eps

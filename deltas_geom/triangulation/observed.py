@@ -12,7 +12,12 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.checks import check_batch
-from deltas_geom.numerics.arithmetic import solver_dtype, surely_all, values_at_hand
+from deltas_geom.numerics.arithmetic import (
+    outside_gradients,
+    solver_dtype,
+    surely_all,
+    values_at_hand,
+)
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.weights import Weights, weigh
@@ -139,7 +144,7 @@ def _inverses(matrix: Tensor) -> Tensor:
     """Of ``(*B, 3, 3)``; 0 with zero gradient if singular within rounding."""
     cofactors = torch.linalg.cross(matrix.roll(-1, dims=-2), matrix.roll(-2, dims=-2))
     determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(dim=-1)[..., None, None]
-    with torch.no_grad():
+    with outside_gradients():
         product = torch.linalg.vector_norm(matrix, dim=-1).prod(dim=-1)[..., None, None]
         size, limits = determinant.abs(), torch.finfo(matrix.dtype)
         # The square of the determinant, in the gradient, has to be representable.

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Inputs, recomputed
 from deltas_geom.records import Record
@@ -57,7 +58,7 @@ def operation(
 
     def computed(derivable: bool, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         seen = see(*tensors)
-        with torch.no_grad():
+        with outside_gradients():
             found, status = solve(seen)
         valid = ok(status)
         if derivable:

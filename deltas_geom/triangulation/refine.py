@@ -13,7 +13,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
 from deltas_geom.checks import check_positive
-from deltas_geom.numerics.arithmetic import without_autocast
+from deltas_geom.numerics.arithmetic import outside_gradients, without_autocast, without_gradients
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
 from deltas_geom.numerics.sums import over_views
@@ -197,7 +197,7 @@ class _Fit(NamedTuple):
 def _fit(problem: _Problem, points: Vector3) -> _Fit:
     observed = problem.observed
     a, b, c = homogeneous_in_views(problem.proj, (*points, torch.ones_like(points[0])))
-    with torch.no_grad():
+    with outside_gradients():
         # Far enough from overflow for squares of all that is divided by the depth.
         smallest = torch.finfo(c.dtype).tiny ** (1 / 6)
         least = (torch.maximum(a.abs(), b.abs()) * (1 / _FARTHEST)).clamp(min=smallest)
@@ -208,7 +208,7 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
     distance = torch.addcmul(dx * dx, dy, dy)
     error = (observed.weights.squared * distance).sum(dim=-2)
     rho, influence, bend = problem.robust(distance)
-    with torch.no_grad():
+    with outside_gradients():
         behind = ((depth - c) * observed.weights.used).sum(dim=-2) > 0
         cost = error if rho is distance else (observed.weights.squared * rho).sum(dim=-2)
     cost = torch.where(behind, torch.inf, cost.detach())
@@ -237,7 +237,7 @@ def _descend(problem: _Problem, steps: int) -> _End:
     return points, error, valid
 
 
-@torch.no_grad()
+@without_gradients
 def _rounding(problem: _Problem, fit: _Fit) -> Tensor:
     """What rounding of the projections may cost a perfect match, ``(*B, N)`` px^2."""
     by_depth = problem.observed.weights.squared * fit.inverse * fit.inverse
@@ -267,13 +267,13 @@ def _descend_implicitly(problem: _Problem, steps: int) -> _End:
     They are -H^-1 dg with the cost's whole second derivative H. Gauss-Newton's normal matrix,
     which leaves out how residuals and losses bend, would be wrong by their share.
     """
-    with torch.no_grad():
+    with outside_gradients():
         end, _, valid = _descend(problem, steps)
     end = tuple(component.detach() for component in end)
     fit = _fit(problem, end)
     normal, right = _normal_equations(problem, fit)
     seen, squared = (fit.place, fit.offset, fit.inverse), problem.observed.weights.squared
-    with torch.no_grad():
+    with outside_gradients():
         counted = squared * fit.influence, squared * fit.bend
         hessian = second_derivative(normal, problem.proj, *seen, *counted)
     change, strict = solve3_scaled(tuple(entry.detach() for entry in hessian), right)

@@ -6,7 +6,13 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.numerics.arithmetic import only, surely_all, unless_all
+from deltas_geom.numerics.arithmetic import (
+    only,
+    outside_gradients,
+    surely_all,
+    unless_all,
+    without_gradients,
+)
 from deltas_geom.numerics.vectors import Vector3
 from deltas_geom.triangulation.observed import homogeneous_in_views
 
@@ -36,7 +42,7 @@ def reproject(proj: Tensor, points: Vector3, used: Tensor) -> Reprojection:
 def projected(x: Tensor, y: Tensor, z: Tensor, used: Tensor) -> Reprojection:
     """The same of homogeneous pixels."""
     info = torch.finfo(z.dtype)
-    with torch.no_grad():
+    with outside_gradients():
         # Far above the smallest number, so that squares of the inverse are finite.
         seen = used & (z > info.tiny**0.25)
         # Projections so far out that products of their squares overflow are beside the camera.
@@ -59,7 +65,7 @@ def mean_of(errors: Tensor, seen: Tensor, squared: Tensor) -> Tensor:
     return safe_sqrt(safe_divide(sums, total, total > 0))
 
 
-@torch.no_grad()
+@without_gradients
 def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
     """Largest angle ``(*B, N)`` rad between rays from ``(*B, V, 3)`` to the points.
 

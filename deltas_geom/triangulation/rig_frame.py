@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import only, unless_all
+from deltas_geom.numerics.arithmetic import only, outside_gradients, unless_all
 from deltas_geom.numerics.sums import over_views
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, dot, scaled
 from deltas_geom.triangulation.weights import Weights
@@ -95,7 +95,7 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
     inverse = total.reciprocal()
     origin = scaled(tuple(offset), inverse)
     spread = square * inverse - dot(origin, origin)
-    with torch.no_grad():
+    with outside_gradients():
         count, size, *offset, from_world, broken = counted
         share = count.clamp(min=1).reciprocal()
         size, middle = size * share, scaled(tuple(offset), share)

@@ -13,6 +13,7 @@ from deltas_geom.checks import check_positive
 from deltas_geom.numerics.arithmetic import (
     both,
     only,
+    outside_gradients,
     surely_all,
     unless_all,
     without_autocast,
@@ -101,7 +102,7 @@ def triangulate_robust(
     if max_pairs < 1:
         raise ValueError(f"max_pairs must be 1 or more, got {max_pairs}")
 
-    with torch.no_grad():
+    with outside_gradients():
         known = KnownCameras(proj)
         observed = _observe(known, pixels, weights, mask, batch)
         chunk = max(1, min(8192, _BUDGET // max(1, observed.usable.shape[:-1].numel())))

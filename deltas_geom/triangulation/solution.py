@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import surely_all
+from deltas_geom.numerics.arithmetic import surely_all, without_gradients
 from deltas_geom.numerics.ldl import multiply
 from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
 from deltas_geom.numerics.vectors import (
@@ -67,7 +67,7 @@ class Solution(NamedTuple):
     vector: Vector4
 
 
-@torch.no_grad()
+@without_gradients
 def solve_linear(equations: Linear) -> tuple[Solution, Tensor]:
     """The points that minimise the algebraic error, without gradient, and their status."""
     info, frame, datum = torch.finfo(equations.dtype), equations.frame, equations.datum

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import at_least_in_single, without_autocast
+from deltas_geom.numerics.arithmetic import at_least_in_single, outside_gradients, without_autocast
 from deltas_geom.triangulation.refine import Refined, refine_points
 from deltas_geom.triangulation.robust import triangulate_robust
 from deltas_geom.triangulation.robust_loss import Loss
@@ -79,7 +79,7 @@ def triangulate_robust_tracks(
     robust = partial(
         triangulate_robust, threshold=threshold, min_inliers=min_inliers, max_pairs=max_pairs
     )
-    with torch.no_grad():
+    with outside_gradients():
         seen = (seen_by(group, proj, camera_index, weights, pixels) for group in groups.groups)
         found = [robust(cameras, xy, weight) for cameras, weight, xy in seen]
         inliers = groups.observations([one.inliers.squeeze(-1) for one in found])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
-from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
+from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast, without_gradients
 from deltas_geom.records import Record
 from deltas_geom.status import Status
 from deltas_geom.triangulation.operation import operation
@@ -186,7 +186,7 @@ def _describe(
     return fields
 
 
-@torch.no_grad()
+@without_gradients
 def _parallax(rays: Tensor, used: Tensor, point: Tensor, count: int) -> Tensor:
     """Angles ``(N)`` between the used of rays ``(3, T)``: of one far from their middle, to another.
 

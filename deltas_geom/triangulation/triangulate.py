@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from deltas_geom.numerics.arithmetic import values_at_hand, without_autocast
+from deltas_geom.numerics.arithmetic import outside_gradients, values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Adjoint, Function, recomputed, transformed
 from deltas_geom.triangulation.equations import FRAMES, Frame, Rig, check_settings, rig_of
@@ -162,7 +162,7 @@ class Call:
 
     def solved(self) -> tuple[Tensor, Tensor]:
         """Points ``(*B, N, 3)`` in the solver's type and their status, without gradient."""
-        with torch.no_grad():
+        with outside_gradients():
             return self.way.solved(*self.tensors[1:])
 
     def points(self) -> Tensor:

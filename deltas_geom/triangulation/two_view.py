@@ -12,7 +12,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide, safe_sqrt
 from deltas_geom.checks import check_batch
 from deltas_geom.epipolar.fundamental import cross_matrix
-from deltas_geom.numerics.arithmetic import only, without_autocast
+from deltas_geom.numerics.arithmetic import only, outside_gradients, without_autocast
 from deltas_geom.numerics.sums import product
 from deltas_geom.numerics.vectors import Vector3, dot
 from deltas_geom.records import Record
@@ -196,7 +196,7 @@ def _solve(seen: _Seen, valid: Tensor | None = None) -> _Solved:
     along = along / _safe(squared).unsqueeze(-2)
     # From both cameras, so that their order does not count.
     points = (centers[..., None] + ray * along.unsqueeze(-2)).mean(dim=-3)
-    with torch.no_grad():
+    with outside_gradients():
         beside = torch.stack([safe_sqrt(dot(one, one)) for one in passing], dim=-2)
         length, cosine = safe_sqrt(squared), dot(first, second)
         sine = length * _safe(squared + cosine * cosine).rsqrt()

@@ -6,7 +6,12 @@ import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_tensor
-from deltas_geom.numerics.arithmetic import at_least_in_single, solver_dtype, without_autocast
+from deltas_geom.numerics.arithmetic import (
+    at_least_in_single,
+    outside_gradients,
+    solver_dtype,
+    without_autocast,
+)
 from deltas_geom.numerics.symmetric3 import inverse3
 from deltas_geom.numerics.vectors import Symmetric3, Vector3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
@@ -187,7 +192,7 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
     (cameras, _), work = finite_cameras(proj), solver_dtype(proj)
     finite = _fits(covariance, torch.finfo(covariance.dtype).max)
     spread = torch.where(finite, covariance, 0.0).to(work)
-    with torch.no_grad():
+    with outside_gradients():
         size = spread.abs().amax(dim=(-2, -1), keepdim=True)
         size = torch.where(size > 0, size, 1.0)
     axis = cameras[..., 2, :3]
@@ -225,7 +230,7 @@ def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetr
 
 def inverse_information(normal: Sequence[Tensor], enough: Tensor) -> Symmetric3:
     """Inverses, six ``(*B, N)``; 0 unless ``enough``, and as of :func:`covariance_of`."""
-    with torch.no_grad():
+    with outside_gradients():
         trace, limit = normal[0] + normal[3] + normal[5], torch.finfo(normal[0].dtype).max
         ordinary = enough & (trace > limit**-0.45) & (trace < limit**0.45)
         unit = torch.where(ordinary, trace, 1.0)

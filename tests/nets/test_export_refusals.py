@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from exported_depth import needs_extra
+from exported_depth import needs_extra, room
 from run_command import Run, assert_one_line
 from torch import Tensor
 
@@ -96,6 +96,16 @@ def test_nothing_is_written_where_the_depth_differs(
     with pytest.raises(UserError, match="nothing was written"):
         export_onnx(untrained, tmp_path / "x.onnx", SMALL)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_region_without_gradients_lies_in_another(
+    untrained: Deltas, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A program is traced in pieces at each of them, which takes twice as long.
+    inputs = room(1, SMALL)
+    with torch.no_grad():
+        monkeypatch.setattr(torch, "no_grad", lambda: pytest.fail("gradients are off already"))
+        FixedDeltas(untrained, SMALL)(*inputs)
 
 
 def test_what_onnx_cannot_say_is_an_error_in_a_line() -> None:

@@ -17,7 +17,7 @@ from deltas_geom.cameras.lenses.terms import (
     gain,
     image_radius,
 )
-from deltas_geom.numerics.arithmetic import surely_all, values_at_hand
+from deltas_geom.numerics.arithmetic import surely_all, values_at_hand, without_gradients
 from deltas_geom.numerics.vectors import either
 from deltas_geom.records import mapped
 
@@ -39,7 +39,7 @@ class Undistorted(NamedTuple):
     found: Tensor
 
 
-@torch.no_grad()
+@without_gradients
 def undistort(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted:
     """The points that go to (u, v), and whether there is one within the disc that is one to one.
 

@@ -24,6 +24,7 @@ from torch import Tensor
 from deltas_geom.cameras.lenses.closed import Coefficients, Seen
 from deltas_geom.cameras.lenses.models import Model
 from deltas_geom.cameras.lenses.tables import Table, table_of
+from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_geom.numerics.chunks import alike
 
 Array = NDArray[Any]
@@ -185,7 +186,7 @@ def _table(
         x, _, z, known = model.rays(terms, within, u, torch.zeros_like(u), False)
         return (x / ((1 + z) * u * unit)).numpy(), known.numpy()
 
-    with torch.no_grad():
+    with outside_gradients():
         return table_of(half_tangents, end, _TOLERANCE)
 
 

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.arithmetic import without_gradients
+
 Pair = tuple[Tensor, Tensor]
 _FARTHEST = 1e6  # slope: beyond it is the camera's own plane
 
@@ -138,7 +140,7 @@ def _moved(x: Tensor, y: Tensor, g: Tensor, shift: Sequence[Tensor]) -> Pair:
     return torch.addcmul(shift[0], x, g), torch.addcmul(shift[1], y, g)
 
 
-@torch.no_grad()
+@without_gradients
 def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
     """The radius of the disc around the axis in which distortion is one to one, ``(*B, 1)``.
 

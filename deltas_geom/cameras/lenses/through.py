@@ -14,6 +14,7 @@ from deltas_geom.checks import batch_shape, check_shapes
 from deltas_geom.numerics.arithmetic import (
     finite_or_zero,
     only,
+    outside_gradients,
     promoted,
     solver_dtype,
     surely_below,
@@ -99,7 +100,7 @@ def _rays_of_many(
     if not MODELS[model].around_axis:
         return lambda *given: by_chunks(plain, given[-1])
     parts = (_terms(coefficients), reach.flatten(), pixels, plain)
-    with torch.no_grad():
+    with outside_gradients():
         found = rays_around_axis(MODELS[model], K, *parts)
     return None if found is None else lambda *given: found(given[-1])
 

@@ -18,6 +18,7 @@ from deltas_geom.numerics.arithmetic import (
     surely_all,
     unless_all,
     without_autocast,
+    without_gradients,
 )
 from deltas_geom.records import Record
 
@@ -168,7 +169,7 @@ def _remapped(
     return only(image, mask), new_K, mask
 
 
-@torch.no_grad()
+@without_gradients
 def pinhole_K(
     lens: Lens, *, old_size: tuple[int, int], new_size: tuple[int, int], alpha: float
 ) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom import PosedViews, sample_inv_depths
+from deltas_geom.numerics.arithmetic import without_gradients
 
 
 class Bins(NamedTuple):
@@ -33,7 +34,7 @@ def bin_centres(num_bins: int, depth_range: tuple[float, float], *, like: Tensor
     return torch.linspace(1 / far, 1 / near, num_bins, device=like.device, dtype=like.dtype)
 
 
-@torch.no_grad()
+@without_gradients
 def samples_per_bin(
     views: PosedViews,
     keypoints: Tensor,

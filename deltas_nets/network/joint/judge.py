@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from deltas_geom import Matches, PosedViews, Triangulation
 from deltas_geom.cameras.homogeneous import safe_divide
+from deltas_geom.numerics.arithmetic import without_gradients
 from deltas_nets.network.joint.context import WIDTH
 from deltas_nets.network.joint.parallax import parallax_of, relative_error_per_pixel
 from deltas_nets.network.layers import WideLinear
@@ -65,7 +66,7 @@ class Judge(nn.Module):
         return torch.where(chosen.seen, logit.sigmoid(), 0.0)
 
 
-@torch.no_grad()
+@without_gradients
 def of_triangulation(
     chosen: Chosen, matches: Matches, points: Triangulation, views: PosedViews
 ) -> Tensor:
@@ -93,7 +94,7 @@ def of_triangulation(
     )
 
 
-@torch.no_grad()
+@without_gradients
 def of_refinement(chosen: Chosen, matches: Matches) -> Tensor:
     """How far views moved their matches, how much they trust them, how many: ``(B, N, 3)``."""
     used = matches.mask[:, 1:]
@@ -103,7 +104,7 @@ def of_refinement(chosen: Chosen, matches: Matches) -> Tensor:
     return torch.stack([moved, trust, count.clamp_max(16) / 4], dim=-1)
 
 
-@torch.no_grad()
+@without_gradients
 def of_posterior(posterior: Posterior, *, window: int) -> Tensor:
     """Is there a second depth, and did the points around change this one's? ``(B, N, 2)``, bounded.
 

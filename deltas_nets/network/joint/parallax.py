@@ -5,11 +5,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from deltas_geom import PosedViews, Triangulation
+from deltas_geom.numerics.arithmetic import without_gradients
 
 SMALLEST = 1e-4  # rad
 
 
-@torch.no_grad()
+@without_gradients
 def parallax_of(views: PosedViews, points: Triangulation, used: Tensor) -> Tensor:
     """Largest angle ``(B, N)`` rad between the anchor's ray and that of a used source.
 
@@ -28,7 +29,7 @@ def parallax_of(views: PosedViews, points: Triangulation, used: Tensor) -> Tenso
     return torch.where(points.valid, torch.where(used, chord, 0.0).amax(dim=1), 0.0)
 
 
-@torch.no_grad()
+@without_gradients
 def relative_error_per_pixel(views: PosedViews, parallax: Tensor) -> Tensor:
     """Relative error of depth ``(B, N)`` that one pixel gives, within [1e-4, 1].
 

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deltas_geom.checks import check_shapes
+from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_nets.network.layers import zero_initialised
 
 FACTOR = 2
@@ -63,7 +64,7 @@ class ConvexUpsampling(nn.Module):
         super().__init__()
         self.conv = zero_initialised(nn.Conv2d(channels, NUM_LOGITS, WINDOW, padding=WINDOW // 2))
         assert self.conv.bias is not None
-        with torch.no_grad():
+        with outside_gradients():
             self.conv.bias.copy_(bilinear_logits())
 
     def forward(self, features: Tensor) -> Tensor:
