@@ -10,6 +10,7 @@ from torch import Tensor
 from deltas_geom.numerics.sums import SERIAL
 
 _SMALLEST_CHUNK = 512  # points
+_IN_CACHE = 4  # views of as many points as start no threads
 
 
 class Cut(NamedTuple):
@@ -20,14 +21,18 @@ class Cut(NamedTuple):
         inputs: for each input the dim, from the end, along which it holds points; 0 if it is whole
             in every chunk.
         outputs: the same of each output.
+        values: points at a time where no derivative is computed; None for as many.
     """
 
     size: int
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
+    values: int | None = None
 
 
-def cut_points(tensor: Tensor, *dims: int, outputs: tuple[int, ...], least: int = 1) -> Cut | None:
+def cut_points(
+    tensor: Tensor, *dims: int, outputs: tuple[int, ...], least: int = 1, serial: bool = False
+) -> Cut | None:
     """A cut for cameras and what is known of points, of which ``tensor`` ``(*B, V, N, K)`` tells N.
 
     Args:
@@ -36,14 +41,21 @@ def cut_points(tensor: Tensor, *dims: int, outputs: tuple[int, ...], least: int 
         *dims: of the inputs after the cameras.
         outputs: of the outputs.
         least: how many numbers of a point to reckon with where its views are fewer.
+        serial: values are computed without operations on all views that could start threads. More
+            points are taken at a time then: each time costs as much in calls as 2000 points.
     """
     # A compiler fuses what lies between instead, and may not know the number of points.
     if torch.compiler.is_compiling():
         return None
     # The same however many threads torch may start: a pass costs what it costs with one.
     *batch, views, count, _ = tensor.shape
-    size = max(_SMALLEST_CHUNK, SERIAL // max(1, math.prod(batch) * max(views, least)))
-    return Cut(alike(count, size), (0, *dims), outputs) if count > size else None
+    places = max(1, math.prod(batch))
+    size = max(_SMALLEST_CHUNK, SERIAL // (places * max(views, least, 1)))
+    if count <= size:
+        return None
+    cut = Cut(alike(count, size), (0, *dims), outputs)
+    longer = max(size, SERIAL * min(_IN_CACHE, views) // (places * max(views, 1)))
+    return cut._replace(values=alike(count, longer)) if serial else cut
 
 
 def alike(count: int, size: int) -> int:

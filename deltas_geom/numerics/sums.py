@@ -59,9 +59,15 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _plain(a: Tensor, b: Tensor) -> bool:
-    """May the product leave torch: nobody traces or derives it?"""
-    derived = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
-    return not derived and values_at_hand(a) and values_at_hand(b) and a.dtype == b.dtype
+    return plain(a, b) and a.dtype == b.dtype
+
+
+def plain(*tensors: Tensor | None) -> bool:
+    """May an operation leave torch: nobody traces or derives it?"""
+    derived = torch.is_grad_enabled()
+    return all(
+        t is None or (values_at_hand(t) and not (derived and t.requires_grad)) for t in tensors
+    )
 
 
 class _FusedSums(torch.autograd.Function):

@@ -19,11 +19,12 @@ Source: Hartley and Zisserman, 2nd ed., section 12.2, without weights.
 
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deltas_geom.numerics.sums import over_views
+from deltas_geom.numerics.sums import over_views, plain, product
 
 Numbers = TypeVar("Numbers", Tensor, NDArray[Any])
 
@@ -52,11 +53,31 @@ def normal_matrix(
     Returns:
         D (D + 1) / 2 entries ``(*B, N)``.
     """
+    if plain(coefficients, x, y, squared):
+        return product(coefficients, _terms_at_hand(x, y, squared)).unbind(dim=-2)
     if squared is None:
         one = torch.ones_like(x[..., :1, :])
         return over_views(coefficients, torch.addcmul(x * x, y, y), x, y, one)
     across, down = x * squared, y * squared
     return over_views(coefficients, torch.addcmul(x * across, y, down), across, down, squared)
+
+
+def _terms_at_hand(x: Tensor, y: Tensor, squared: Tensor | None) -> Tensor:
+    """What the coefficients belong to, in NumPy: without joining parts, and without threads."""
+    views, values = x.shape[-2], [t.numpy() for t in (x, y, squared) if t is not None]
+    shape = np.broadcast_shapes(*(v.shape for v in values))
+    terms = np.empty((*shape[:-2], 3 * views + (1 if squared is None else views), shape[-1]))
+    square, across, down = (terms[..., k * views : (k + 1) * views, :] for k in range(3))
+    if squared is None:
+        across[...], down[...], terms[..., 3 * views :, :] = *values, 1.0
+    else:
+        weight = terms[..., 3 * views :, :]
+        weight[...] = values[2]
+        np.multiply(values[0], weight, out=across)
+        np.multiply(values[1], weight, out=down)
+    np.multiply(values[0], across, out=square)
+    square += values[1] * down
+    return torch.from_numpy(terms)
 
 
 def normal_coefficients(proj: Tensor, squared: Tensor | None = None) -> Tensor:

@@ -2,12 +2,13 @@
 
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from deltas_geom.checks import check_positive
 from deltas_geom.numerics.arithmetic import only, unless_all
-from deltas_geom.numerics.sums import over_views
+from deltas_geom.numerics.sums import over_views, plain, product
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
@@ -93,9 +94,19 @@ class Equations(NamedTuple):
     def in_front(self, points: Vector3) -> Tensor:
         """As of :class:`Linear`."""
         # A projection matrix is K [R | t] with K[2, 2] = 1: its third row gives metric depth.
-        depth = in_views(self.rig.near[..., 2, :], *points)
-        used = unless_all(~self.observed.weights.unused)
-        return only(depth, used, other=1.0).amin(dim=-2) > 0
+        row, unused = self.rig.near[..., 2, :], self.observed.weights.unused
+        if plain(row, unused, *points):
+            return _ahead_at_hand(row, unused, points)
+        depth = in_views(row, *points)
+        return only(depth, unless_all(~unused), other=1.0).amin(dim=-2) > 0
+
+
+def _ahead_at_hand(row: Tensor, unused: Tensor, points: Vector3) -> Tensor:
+    """Depth above 0 in all used views, in NumPy, which starts no threads."""
+    place = np.stack([points[0].numpy(), points[1].numpy(), points[2].numpy()], axis=-2)
+    depth = product(row[..., :3], torch.from_numpy(place)).numpy()
+    ahead = (depth > -row[..., 3:].numpy()) | unused.numpy()
+    return torch.from_numpy(ahead.all(axis=-2))
 
 
 def rig_of(cameras: Cameras) -> Rig:

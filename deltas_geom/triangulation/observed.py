@@ -7,6 +7,7 @@ passes no NaN and no gradient.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,8 +19,9 @@ from deltas_geom.numerics.arithmetic import (
     surely_all,
     values_at_hand,
 )
-from deltas_geom.numerics.sums import product
+from deltas_geom.numerics.sums import plain, product
 from deltas_geom.numerics.vectors import Vector3
+from deltas_geom.triangulation.weighed import weigh_at_hand
 from deltas_geom.triangulation.weights import Weights, weigh
 
 _DIMS = {
@@ -97,8 +99,25 @@ def observe(
         mask: see there.
         batch: of the cameras, pixels, weights and mask together.
     """
+    if pixels.numel() and batch.numel() and plain(pixels, weights, mask):
+        return _observe_at_hand(pixels, weights, mask, batch)
     x, y, sound = clean_pixels(pixels)
     return Observations(x, y, weigh(weights, mask, batch=batch, like=pixels, sound=sound))
+
+
+def _observe_at_hand(
+    pixels: Tensor, weights: Tensor | None, mask: Tensor | None, batch: torch.Size
+) -> Observations:
+    weight, used = (t if t is None else t.detach().numpy() for t in (weights, mask))
+    # Struct of arrays: sums over views then run over memory in order.
+    seen = np.moveaxis(pixels.detach().numpy(), -1, 0).astype(np.float64, order="C")
+    ones = np.ones((*batch, pixels.shape[-3], 1))
+    with np.errstate(all="ignore"):
+        found = weigh_at_hand(seen, weight, used, ones, coordinates=0, views=-2)
+        squared = found.share * found.share
+    known = (found.largest, ~found.used, found.used.astype(np.float64), found.sound)
+    x, y, squares, *others = map(torch.from_numpy, (*found.pixels, squared, *known))
+    return Observations(x, y, Weights(squares, *others))
 
 
 def clean_pixels(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from deltas_geom.triangulation.dlt import rows
 from deltas_geom.triangulation.judge import REASONS
 from deltas_geom.triangulation.observed import Cameras
-from deltas_geom.triangulation.weights import NEGLIGIBLE_WEIGHT
+from deltas_geom.triangulation.weighed import Weighed, weigh_at_hand
 
 Array = NDArray[Any]
 FEW = 256
@@ -179,30 +179,12 @@ def _over(squared: Array, values: Array) -> Array:
     return found
 
 
-def _observed(
-    pixels: Array, weights: Array | None, mask: Array | None
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Pixels, shares, largest weights, used views and sound points, see :class:`Solved`."""
+def _observed(pixels: Array, weights: Array | None, mask: Array | None) -> Weighed:
+    """Points before views; without a batch what no weight and no mask tells apart."""
     seen = np.moveaxis(pixels, -3, -2).astype(np.float64)
-    everywhere = np.ones((1,) * (seen.ndim - 3) + seen.shape[-3:-1], dtype=bool)
-    if weights is None and mask is None:
-        size = everywhere * 1.0
-    else:
-        weight = np.ones(()) if weights is None else np.swapaxes(weights, -1, -2)
-        size = np.abs(weight.astype(np.float64))
-        if mask is not None:
-            size = np.where(np.swapaxes(mask, -1, -2), size, 0.0)
-    largest = size.max(axis=-1, keepdims=True)
-    share = size / largest
-    finite = np.abs(seen).max(axis=-1) < _LIMIT**0.125  # NaN is not below
-    if finite.all() and (share > NEGLIGIBLE_WEIGHT).all():
-        return seen, share, largest, everywhere, np.ones(everywhere.shape[:-1], dtype=bool)
-    used = ~(size <= NEGLIGIBLE_WEIGHT * largest)
-    counted = largest <= _LIMIT
-    largest = np.where(counted & (largest > 0), largest, 1.0)
-    share = np.where(used & counted & finite, size / largest, 0.0)
-    sound = (finite | ~used).all(axis=-1) & counted[..., 0]
-    return np.where(finite[..., None], seen, 0.0), share, largest, used, sound
+    weights, mask = (t if t is None else np.swapaxes(t, -1, -2) for t in (weights, mask))
+    ones = np.ones((1,) * (seen.ndim - 3) + seen.shape[-3:-1])
+    return weigh_at_hand(seen, weights, mask, ones, coordinates=-1, views=-1)
 
 
 def _stand(

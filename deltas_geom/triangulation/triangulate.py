@@ -146,12 +146,19 @@ class Call:
         self.known, self.frame, self.dtype = known, frame, proj.dtype
         self.alike = weights is None and mask is None
         # What a compiler, a transform or another device holds has no values to look at.
-        plain = all(t is None or (values_at_hand(t) and t.dtype in _PLAIN) for t in self.tensors)
+        self.at_hand = all(
+            t is None or (values_at_hand(t) and t.dtype in _PLAIN) for t in self.tensors
+        )
         count = self.batch.numel() * pixels.shape[-2]
         # The normal matrix of the world's frame loses digits that an SVD of the rows keeps.
         exactly = frame == "world" and proj.dtype == torch.float64
         self.way: ShortWay | LongWay
-        if plain and count > 0 and (count <= FEW or exactly) and not transformed(*self.tensors):
+        if (
+            self.at_hand
+            and count > 0
+            and (count <= FEW or exactly)
+            and not transformed(*self.tensors)
+        ):
             self.way = ShortWay(known.short(), frame, proj.dtype)
         else:
             self.way = self.long(known.long())
@@ -206,7 +213,8 @@ class Call:
         outputs: tuple[int, ...],
         adjoint: Adjoint | None = None,
     ) -> tuple[Tensor, ...]:
-        cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs)
+        serial = self.at_hand and adjoint is not None and self.dtype == torch.float32
+        cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs, serial=serial)
         return recomputed(function, *self.tensors, values=values, cut=cut, adjoint=adjoint)
 
 
