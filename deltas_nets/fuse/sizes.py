@@ -98,8 +98,11 @@ def look_at(source: DepthSource, voxel: float | None) -> Sizes:
 
 
 def _some_points(view: DepthView, origin: Tensor) -> Tensor:
-    """``(N, 3)`` from the origin."""
-    points = view.points()[::4, ::4]
+    """``(N, 3)`` from the origin, one or more of a view that has depth."""
+    every = view.points()
+    points = every[::4, ::4]
+    if not (points[..., 2] > 0).any():
+        points = every  # so little depth that all of it may lie between the rows
     points = points[points[..., 2] > 0].double()
     world_from_cam = view.world_from_cam
     return points @ world_from_cam[:3, :3].T + (world_from_cam[:3, 3] - origin)

@@ -362,3 +362,26 @@ def test_the_depth_command_warns_where_nothing_can_be_fused(
     fuse_maps(capture, folder, cloud=False, mesh=True, device="cpu", overwrite=False)
     told = capfd.readouterr().err
     assert "nothing was fused" in told and "deltas fuse --min-confidence 0" in told
+
+
+def test_maps_of_a_single_pixel_are_looked_at(maps: tuple[Path, Path], tmp_path: Path) -> None:
+    for file in (maps[1] / "depth").iterdir():
+        steps = np.zeros((48, 64), dtype=np.uint16)
+        steps[1, 2] = 2500  # between the rows and columns of which a look takes every fourth
+        Image.fromarray(steps).save(file)
+    source = depth_source(open_capture(maps[0]), maps[1])
+    assert look_at(source, None).area > 0
+    with pytest.raises(UserError, match="no depth is left"):
+        fuse_capture(source, tmp_path / "fused", FuseConfig())
+
+
+def test_hardly_any_sure_pixel_is_not_told_as_maps_that_contradict(
+    maps: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for number, file in enumerate((maps[1] / "confidence").iterdir()):
+        bytes = np.zeros((48, 64), dtype=np.uint8)
+        bytes[number, number] = 255
+        Image.fromarray(bytes).save(file)
+    source = depth_source(open_capture(maps[0]), maps[1], min_confidence=1)
+    with pytest.raises(UserError, match=r"sure enough \(1 or more\).*--min-confidence 0"):
+        fuse_capture(source, tmp_path / "fused", FuseConfig(voxel=0.001))
