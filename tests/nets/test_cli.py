@@ -232,6 +232,18 @@ def test_lost_poses_are_left_out_with_one_warning(depth: DepthCommand) -> None:
     assert depth.summary()["lost_poses"] == [2]
 
 
+@pytest.mark.parametrize("place", ["a-file", "a-file/below", "filled"])
+def test_a_place_that_cannot_be_filled_is_told_before_anything_is_computed(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.setattr(Depth, "predictor", lambda _: pytest.fail("a network was loaded"))
+    (tmp_path / "filled").mkdir()
+    (tmp_path / "filled" / "notes.txt").touch()
+    (tmp_path / "a-file").touch()
+    result = run("depth", write_capture(tmp_path / "capture"), "--out", tmp_path / place)
+    assert_one_line(result, place, "name a")
+
+
 def test_folders_of_captures_with_dots_in_their_names_do_not_collide(tmp_path: Path) -> None:
     for name in ("scene.1", "scene.2"):
         (tmp_path / name).mkdir()
