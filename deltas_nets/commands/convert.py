@@ -79,12 +79,17 @@ class Convert(Command):
         unit = self._unit(capture)
         if self.depths is not None:
             from deltas_nets.fuse.seeds import seeds, with_maps
-            from deltas_nets.fuse.sources import depth_source
+            from deltas_nets.fuse.sources import Predicted, depth_source
 
             source = depth_source(capture, self.depths)
+            source.check()
+            if isinstance(source, Predicted) and source.missing:
+                warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
+            without = self.to in ("colmap", "colmap-bin")  # no depth, but points all the same
+            capture = with_maps(source.capture, self.depths, wanted=not without)
             with progress("points", len(source.ids)) as report:
                 found = seeds(source, self.points or POINTS, report=report)
-            capture = replace(with_maps(source.capture, self.depths), points=found)
+            capture = replace(capture, points=found)
             print(f"{len(found.xyz)} points that two maps or more agree on")
         if unit is not None:
             # Maps may be in metres already; and what a sensor tells the unit by is.
