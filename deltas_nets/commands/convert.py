@@ -77,6 +77,7 @@ class Convert(Command):
 
         capture = opened(self.capture, self.intrinsics)
         unit = self._unit(capture)
+        holds_depth = self.to not in ("colmap", "colmap-bin")
         if self.depths is not None:
             from deltas_nets.fuse.seeds import seeds, with_maps
             from deltas_nets.fuse.sources import Predicted, depth_source
@@ -85,8 +86,7 @@ class Convert(Command):
             source.check()
             if isinstance(source, Predicted) and source.missing:
                 warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
-            without = self.to in ("colmap", "colmap-bin")  # no depth, but points all the same
-            capture = with_maps(source.capture, self.depths, wanted=not without)
+            capture = with_maps(source.capture, self.depths, wanted=holds_depth)
             with progress("points", len(source.ids)) as report:
                 found = seeds(source, self.points or POINTS, report=report)
             capture = replace(capture, points=found)
@@ -98,7 +98,8 @@ class Convert(Command):
             capture = scaled(capture, change) if by_sensor else in_metres(capture, change)
         with progress("writing", len(capture.frames)) as report:
             left_out = save_capture(capture, self.out, self.to, placing=self.images, report=report)
-        for doubt in (*capture.doubts, *left_out, *doubts_of_images(capture)):
+        broken = doubts_of_images(capture, depth=holds_depth)
+        for doubt in (*capture.doubts, *left_out, *broken):
             warn(doubt)
         if capture.lost:
             warn(f"frames that cannot be used are left out: {ids_in_words(capture.lost)}")
