@@ -85,7 +85,7 @@ def look_at(source: DepthSource, voxel: float | None) -> Sizes:
             points.append(_some_points(view, origin))
     if not depths:
         what = "no pixel of the maps has depth"
-        if source.least_confidence == 0:
+        if not any(source.doubtful.values()):  # what was read had none, sure or not
             raise UserError(what, source.capture.path, "look at them: there is nothing to fuse")
         what = f"{what} that is sure enough ({source.least_confidence:.2g} or more)"
         remedy = "deltas fuse --min-confidence 0 uses all depth, sure or not"

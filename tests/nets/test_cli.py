@@ -218,6 +218,14 @@ def test_depth_beyond_the_file_is_a_warning(
     assert depth.summary()["frames"]["0"]["saturated_pixels"] == pytest.approx(48 * 32, rel=0.05)
 
 
+def test_maps_that_are_left_without_depth_are_told(depth: DepthCommand) -> None:
+    told = depth("--min-confidence", 1, "--mesh")
+    assert told.code == 0
+    assert "4 maps without any depth: no pixel is as sure as --min-confidence 1" in told.err
+    assert "no pixel of the maps has depth, " in told.err  # which no other setting of fuse mends
+    assert all(record["empty"] for record in depth.summary()["frames"].values())
+
+
 def test_size_and_confidence_are_obeyed(depth: DepthCommand) -> None:
     assert depth("--size", 40, 50, "--min-confidence", 1).code == 0
     assert depth.map(0).shape == (40, 50) and (depth.map(0) == 0).all()
