@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
 
@@ -29,6 +30,17 @@ def counted(count: int, noun: str) -> str:
 def warn(text: str) -> None:
     """Print one line on standard error, for what is not fatal."""
     print(f"deltas: warning: {text}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def without_warnings_of_pillow() -> Iterator[None]:
+    """Pillow warns of large images and damaged ones with lines of its code.
+
+    Large ones are welcome, and of damaged ones our own line tells.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"PIL\.")
+        yield
 
 
 @contextlib.contextmanager

@@ -29,19 +29,31 @@ WRITERS: Mapping[str, Writer] = {
 """By the name of the format; see `deltas_nets.captures.writers` for what they do."""
 
 
-def doubts_of_images(capture: Capture) -> list[str]:
-    """A warning of the images that are copied as they are though nobody can use them."""
-    broken: dict[str, UserError] = {}
+def doubts_of_images(capture: Capture, *, depth: bool = True) -> list[str]:
+    """Warnings of images that are copied as they are though nobody can use them.
+
+    Args:
+        capture: whose images were copied.
+        depth: whether those of its sensor were, too.
+    """
+    images: dict[str, UserError] = {}
+    depths: dict[str, UserError] = {}
     for id, frame in capture.frames.items():
-        try:
-            frame.check_image()
-        except UserError as error:
-            broken[id] = error
-    if not broken:
-        return []
-    first = next(iter(broken.values()))
-    count = counted(len(broken), "image")
-    return [f"{count} cannot be used ({ids_in_words(broken)}): {first}"]
+        checks = [(images, frame.check_image)]
+        if depth and frame.depth_path is not None:
+            checks.append((depths, frame.check_depth))
+        for broken, check in checks:
+            try:
+                check()
+            except UserError as error:
+                broken[id] = error
+    doubts = []
+    for broken, noun in ((images, "image"), (depths, "depth image")):
+        if broken:
+            first = next(iter(broken.values()))
+            count = counted(len(broken), noun)
+            doubts.append(f"{count} cannot be used ({ids_in_words(broken)}): {first}")
+    return doubts
 
 
 def _refused(error: OSError, out: Path) -> UserError:

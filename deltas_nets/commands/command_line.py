@@ -16,7 +16,11 @@ from deltas_nets.commands.grouped_help import grouped_help
 from deltas_nets.commands.values import check_values
 from deltas_nets.commands.words import first_page, sentence
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import silent_without_reader, stopped_like_ctrl_c
+from deltas_nets.terminal import (
+    silent_without_reader,
+    stopped_like_ctrl_c,
+    without_warnings_of_pillow,
+)
 
 __all__ = ["parse", "run"]
 
@@ -35,7 +39,7 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
         command = parse(list(arguments), commands)
         try:
             check_values(command)
-            with stopped_like_ctrl_c():
+            with stopped_like_ctrl_c(), without_warnings_of_pillow():
                 command.run()
         except UserError as error:
             if command.debug:

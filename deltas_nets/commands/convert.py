@@ -77,14 +77,19 @@ class Convert(Command):
 
         capture = opened(self.capture, self.intrinsics)
         unit = self._unit(capture)
+        holds_depth = self.to not in ("colmap", "colmap-bin")
         if self.depths is not None:
             from deltas_nets.fuse.seeds import seeds, with_maps
-            from deltas_nets.fuse.sources import depth_source
+            from deltas_nets.fuse.sources import Predicted, depth_source
 
             source = depth_source(capture, self.depths)
+            source.check()
+            if isinstance(source, Predicted) and source.missing:
+                warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
+            capture = with_maps(source.capture, self.depths, wanted=holds_depth)
             with progress("points", len(source.ids)) as report:
                 found = seeds(source, self.points or POINTS, report=report)
-            capture = replace(with_maps(source.capture, self.depths), points=found)
+            capture = replace(capture, points=found)
             print(f"{len(found.xyz)} points that two maps or more agree on")
         if unit is not None:
             # Maps may be in metres already; and what a sensor tells the unit by is.
@@ -93,7 +98,8 @@ class Convert(Command):
             capture = scaled(capture, change) if by_sensor else in_metres(capture, change)
         with progress("writing", len(capture.frames)) as report:
             left_out = save_capture(capture, self.out, self.to, placing=self.images, report=report)
-        for doubt in (*capture.doubts, *left_out, *doubts_of_images(capture)):
+        broken = doubts_of_images(capture, depth=holds_depth)
+        for doubt in (*capture.doubts, *left_out, *broken):
             warn(doubt)
         if capture.lost:
             warn(f"frames that cannot be used are left out: {ids_in_words(capture.lost)}")

@@ -108,12 +108,14 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.captures.keyframes import keyframes
         from deltas_nets.captures.usable import check_all, lone_frames, usable_view_sets, warn_of
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
+        from deltas_nets.outputs.prepare import check_place
         from deltas_nets.predict.capture import predict_capture
 
         shard = read_shard(self.shard)
         config = self.config(size=self.size, min_confidence=self.min_confidence)
         options = asked_options(self.depth_scale, self.format)
         capture = self.opened(self.capture).remembering()
+        check_place(self.folder, overwrite=self.overwrite, forbidden=capture.path)
         predictor = self.predictor()
         if self.sensor_depth is not None:
             predictor.check_measured()

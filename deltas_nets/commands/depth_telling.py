@@ -33,6 +33,16 @@ def tell(outcome: "Outcome", folder: "OutputFolder", options: "OutputOptions", f
             f"points of {maps} pile up at an end of the depth that was searched: is --depth-range "
             "too narrow, or a pose wrong? See summary.json"
         )
+    empty = sum("empty" in record for record in folder.frames.values())
+    if empty:
+        settings = (read_summary(folder.path / SUMMARY) or {}).get("settings", {})
+        least = settings.get("predict", {}).get("min_confidence", 0)
+        why = (
+            f": no pixel is as sure as --min-confidence {least:g}"
+            if least
+            else ", see summary.json"
+        )
+        warn(f"{counted(empty, 'map')} without any depth{why}")
     saturated = sum("saturated_pixels" in record for record in folder.frames.values())
     if saturated:
         most = f"{options.max_depth:g} {'m' if options.unit == 'metre' else 'units'}"

@@ -190,4 +190,6 @@ def _nothing(source: DepthSource, left_out: LeftOut, sizes: Sizes, config: FuseC
     what = f"voxels of {sizes.voxel:g} show no surface of the depth that is left"
     if left_out.used == 0:
         what = "no depth is left: maps do not overlap, or do not agree"
+        if left_out.doubtful > left_out.unconfirmed:
+            what = f"hardly any depth is sure enough ({source.least_confidence:.2g} or more)"
     return UserError(what, source.capture.path, cure(left_out, sizes, config))

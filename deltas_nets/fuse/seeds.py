@@ -39,15 +39,16 @@ SAME = 0.02
 """Share of the depth by which a map may miss a point that it is said to see."""
 
 
-def with_maps(capture: Capture, folder: Path) -> Capture:
+def with_maps(capture: Capture, folder: Path, *, wanted: bool = True) -> Capture:
     """The capture with maps of `deltas depth` in the place of what a sensor measured.
 
     Args:
         capture: in the unit of the maps.
         folder: of the maps; frames without one have no depth.
+        wanted: False where the capture may do without them, as for a format that holds no depth.
 
     Raises:
-        UserError: the maps are of a format that captures do not hold.
+        UserError: the maps are of a format that captures do not hold, and they are wanted.
     """
     # Whole, as frames join what is relative to the capture's own folder.
     folder, scale = folder.resolve(), recorded_depth_scale(folder)
@@ -56,7 +57,7 @@ def with_maps(capture: Capture, folder: Path) -> Capture:
         file = folder / "depth" / f"{frame.id}.png"
         told = {"depth_path": file, "depth_scale": scale} if file.exists() else NO_DEPTH
         frames.append(replace(frame, **{**NO_DEPTH, **told}))
-    if all(frame.depth_path is None for frame in frames):
+    if wanted and all(frame.depth_path is None for frame in frames):
         what = "the maps are not PNG, which captures hold depth in"
         raise UserError(what, folder, "run deltas depth with --format png")
     return replace(capture, frames=Frames.of(frames, capture.frames.folder))
@@ -102,7 +103,9 @@ def seeds(
     found = _together(parts)
     if len(found.xyz) == 0:
         what = "no two maps agree on any point"
-        raise UserError(what, capture.path, "look at deltas check, or lower --min-confidence")
+        if source.least_confidence > 0:
+            what = f"{what} that is sure enough ({source.least_confidence:.2g} or more)"
+        raise UserError(what, capture.path, "deltas check tells what is wrong with a capture")
     return found
 
 

@@ -85,7 +85,7 @@ def look_at(source: DepthSource, voxel: float | None) -> Sizes:
             points.append(_some_points(view, origin))
     if not depths:
         what = "no pixel of the maps has depth"
-        if source.least_confidence == 0:
+        if not any(source.doubtful.values()):  # what was read had none, sure or not
             raise UserError(what, source.capture.path, "look at them: there is nothing to fuse")
         what = f"{what} that is sure enough ({source.least_confidence:.2g} or more)"
         remedy = "deltas fuse --min-confidence 0 uses all depth, sure or not"
@@ -98,8 +98,11 @@ def look_at(source: DepthSource, voxel: float | None) -> Sizes:
 
 
 def _some_points(view: DepthView, origin: Tensor) -> Tensor:
-    """``(N, 3)`` from the origin."""
-    points = view.points()[::4, ::4]
+    """``(N, 3)`` from the origin, one or more of a view that has depth."""
+    every = view.points()
+    points = every[::4, ::4]
+    if not (points[..., 2] > 0).any():
+        points = every  # so little depth that all of it may lie between the rows
     points = points[points[..., 2] > 0].double()
     world_from_cam = view.world_from_cam
     return points @ world_from_cam[:3, :3].T + (world_from_cam[:3, 3] - origin)

@@ -29,7 +29,7 @@ from deltas_nets.outputs.summary import (
     shard_summary,
 )
 
-__all__ = ["prepare_output"]
+__all__ = ["check_place", "prepare_output"]
 
 
 def prepare_output(
@@ -67,8 +67,7 @@ def prepare_output(
     """
     out, frame_ids = Path(out), list(frame_ids)
     wanted = json.loads(json.dumps(plain(settings)))  # as it will be read back
-    _check_no_capture(out, forbidden)
-    check_writable(out)
+    check_place(out, overwrite=overwrite, forbidden=forbidden)
     earlier = _earlier(out, wanted, (head or {}).get("scaled_by"), overwrite=overwrite)
     folder = OutputFolder(
         out,
@@ -107,6 +106,23 @@ def prepare_output(
     return folder
 
 
+def check_place(out: Path, *, overwrite: bool = False, forbidden: Path | None = None) -> None:
+    """Refuse a folder that no settings make fit, before anything is computed for it.
+
+    Args:
+        out: the folder; nothing in it is changed.
+        overwrite: as for `prepare_output`.
+        forbidden: the capture.
+
+    Raises:
+        UserError: it is a capture or a file, cannot be written, or holds something else.
+    """
+    _check_no_capture(out, forbidden)
+    check_writable(out)
+    if not overwrite:
+        _summaries(out)
+
+
 def _check_no_capture(out: Path, forbidden: Path | None) -> None:
     """Refuse a folder whose depth/ may be what a sensor measured: not even --overwrite means it."""
     if forbidden is not None and out.resolve() == forbidden.resolve():
@@ -124,19 +140,29 @@ def _earlier(
     Raises:
         UserError: there is something else, or they had other settings.
     """
-    # Listed before the summaries are read: what another shard has made by now has a summary.
-    found = sorted(os.listdir(out)) if out.exists() else []
-    others = [name for name in found if not TEMPORARY.match(name)]
-    summaries = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
-    earlier = [read for name in summaries if (read := read_summary(out / name)) is not None]
+    earlier = _summaries(out, alone=not overwrite)
     if overwrite:
         return earlier
-    if others and not earlier:
-        what = f"the output folder holds something else ({', '.join(others[:3])})"
-        raise UserError(what, out, "name an empty folder, or add --overwrite")
     if earlier and earlier[0]["settings"] != wanted:
         what = f"an earlier run had other settings ({difference(earlier[0], wanted, scaled_by)})"
         raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
+    return earlier
+
+
+def _summaries(out: Path, *, alone: bool = True) -> list[dict[str, Any]]:
+    """Those of earlier runs.
+
+    Raises:
+        UserError: there is none beside other things, and they are to be ``alone``.
+    """
+    # Listed before the summaries are read: what another shard has made by now has a summary.
+    found = sorted(os.listdir(out)) if out.exists() else []
+    others = [name for name in found if not TEMPORARY.match(name)]
+    names = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
+    earlier = [read for name in names if (read := read_summary(out / name)) is not None]
+    if alone and others and not earlier:
+        what = f"the output folder holds something else ({', '.join(others[:3])})"
+        raise UserError(what, out, "name an empty folder, or add --overwrite")
     return earlier
 
 

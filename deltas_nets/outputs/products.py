@@ -143,10 +143,16 @@ def products_of(options: OutputOptions) -> tuple[Product, ...]:
 
 
 def remarks_on(frame: FrameOutput, options: OutputOptions) -> dict[str, Any]:
-    """What the summary says of a frame beside its record: pixels too far for the depth image."""
+    """What the summary says of a frame beside its record.
+
+    That is how many pixels are too far for the depth image, and whether none has any depth.
+    """
     far = np.asarray(frame.depth, dtype=np.float64) > options.max_depth
     count = int((far & np.isfinite(frame.depth)).sum())
-    return {"saturated_pixels": count} if count else {}
+    remarks: dict[str, Any] = {"saturated_pixels": count} if count else {}
+    if not (np.asarray(frame.depth) > 0).any():
+        remarks["empty"] = True
+    return remarks
 
 
 def steps_to(far: float) -> float:

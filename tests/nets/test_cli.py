@@ -218,6 +218,14 @@ def test_depth_beyond_the_file_is_a_warning(
     assert depth.summary()["frames"]["0"]["saturated_pixels"] == pytest.approx(48 * 32, rel=0.05)
 
 
+def test_maps_that_are_left_without_depth_are_told(depth: DepthCommand) -> None:
+    told = depth("--min-confidence", 1, "--mesh")
+    assert told.code == 0
+    assert "4 maps without any depth: no pixel is as sure as --min-confidence 1" in told.err
+    assert "no pixel of the maps has depth, " in told.err  # which no other setting of fuse mends
+    assert all(record["empty"] for record in depth.summary()["frames"].values())
+
+
 def test_size_and_confidence_are_obeyed(depth: DepthCommand) -> None:
     assert depth("--size", 40, 50, "--min-confidence", 1).code == 0
     assert depth.map(0).shape == (40, 50) and (depth.map(0) == 0).all()
@@ -230,6 +238,18 @@ def test_lost_poses_are_left_out_with_one_warning(depth: DepthCommand) -> None:
     assert "frames without a usable pose are left out: 2" in result.err
     assert not (depth.out / "depth" / "2.png").exists()
     assert depth.summary()["lost_poses"] == [2]
+
+
+@pytest.mark.parametrize("place", ["a-file", "a-file/below", "filled"])
+def test_a_place_that_cannot_be_filled_is_told_before_anything_is_computed(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.setattr(Depth, "predictor", lambda _: pytest.fail("a network was loaded"))
+    (tmp_path / "filled").mkdir()
+    (tmp_path / "filled" / "notes.txt").touch()
+    (tmp_path / "a-file").touch()
+    result = run("depth", write_capture(tmp_path / "capture"), "--out", tmp_path / place)
+    assert_one_line(result, place, "name a")
 
 
 def test_folders_of_captures_with_dots_in_their_names_do_not_collide(tmp_path: Path) -> None:

@@ -226,6 +226,17 @@ def test_images_that_nobody_can_use_are_said(
     assert "1 image cannot be used (1)" in said.err and what in said.err and "4 frames" in said.out
 
 
+def test_sensor_depth_that_nobody_can_use_is_said_where_it_is_written(
+    run: Run, tmp_path: Path
+) -> None:
+    depth = write_capture(tmp_path / "in") / "depth" / "1.png"
+    depth.write_bytes(depth.read_bytes()[:60])
+    said = run("convert", tmp_path / "in", tmp_path / "out")
+    assert "1 depth image cannot be used (1)" in said.err and "4 frames" in said.out
+    model = run("convert", tmp_path / "in", tmp_path / "model", "--to", "colmap")
+    assert "cannot be used" not in model.err  # it has no depth
+
+
 def test_a_sensor_is_no_folder_of_maps(make_capture: MakeCapture, tmp_path: Path, run: Run) -> None:
     given = ("convert", make_capture(), tmp_path / "out", "--to", "own", "--depths", "sensor")
     assert_one_line(run(*given), "--depths sensor")

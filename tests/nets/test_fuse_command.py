@@ -2,11 +2,13 @@
 
 import json
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import small_maps
 import torch
 from conftest import MakeCapture
 from fused_scenes import write_maps
@@ -25,6 +27,8 @@ from deltas_nets.fuse.left_out import LeftOut, cure
 from deltas_nets.fuse.sizes import _up, check_memory, look_at
 from deltas_nets.fuse.sources import depth_source
 from deltas_nets.outputs.beside import FUSE_STATE, FUSE_SUMMARY
+from deltas_nets.outputs.depth_formats import read_depth_map
+from deltas_nets.outputs.products import OutputOptions
 
 FEW = ("--neighbours", "2")
 
@@ -362,3 +366,44 @@ def test_the_depth_command_warns_where_nothing_can_be_fused(
     fuse_maps(capture, folder, cloud=False, mesh=True, device="cpu", overwrite=False)
     told = capfd.readouterr().err
     assert "nothing was fused" in told and "deltas fuse --min-confidence 0" in told
+
+
+def test_maps_of_a_single_pixel_are_looked_at(maps: tuple[Path, Path], tmp_path: Path) -> None:
+    for file in (maps[1] / "depth").iterdir():
+        steps = np.zeros((48, 64), dtype=np.uint16)
+        steps[1, 2] = 2500  # between the rows and columns of which a look takes every fourth
+        Image.fromarray(steps).save(file)
+    source = depth_source(open_capture(maps[0]), maps[1])
+    assert look_at(source, None).area > 0
+    with pytest.raises(UserError, match="no depth is left"):
+        fuse_capture(source, tmp_path / "fused", FuseConfig())
+
+
+def test_hardly_any_sure_pixel_is_not_told_as_maps_that_contradict(
+    maps: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for number, file in enumerate((maps[1] / "confidence").iterdir()):
+        bytes = np.zeros((48, 64), dtype=np.uint8)
+        bytes[number, number] = 255
+        Image.fromarray(bytes).save(file)
+    source = depth_source(open_capture(maps[0]), maps[1], min_confidence=1)
+    with pytest.raises(UserError, match=r"sure enough \(1 or more\).*--min-confidence 0"):
+        fuse_capture(source, tmp_path / "fused", FuseConfig(voxel=0.001))
+
+
+def test_a_damaged_map_is_told_in_our_words_alone(
+    make_capture: MakeCapture, tmp_path: Path, run: Run
+) -> None:
+    capture, options = make_capture(), OutputOptions(depth_format="tiff")
+    file = small_maps.write_maps(capture, tmp_path / "maps", options=options) / "depth" / "1.tiff"
+    file.write_bytes(
+        file.read_bytes()[:100]
+    )  # Pillow warns that what stands at the end is not there
+    with warnings.catch_warnings(record=True) as theirs:
+        warnings.simplefilter("always")
+        with pytest.raises(UserError):
+            read_depth_map(tmp_path / "maps", "1", 1000)
+        assert theirs
+        theirs.clear()
+        assert_one_line(run("fuse", capture, tmp_path / "maps"), "1.tiff", "cannot be read")
+        assert not theirs

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import MakeCapture
+from PIL import Image
 from run_command import Run, assert_one_line
 from small_maps import write_maps
 
@@ -106,3 +107,32 @@ def test_without_agreement_it_is_said(run: Run, capture: Path, tmp_path: Path) -
     assert_one_line(said, "no two maps agree")
     assert not (tmp_path / "out").exists()
     assert_one_line(run("convert", capture, tmp_path / "out", "--points", 0), "--points 0")
+
+
+def test_points_of_maps_in_floats_go_into_a_model(run: Run, capture: Path, tmp_path: Path) -> None:
+    options = OutputOptions(depth_format="npz")
+    maps = write_maps(capture, tmp_path / "maps", depth=wall, options=options)
+    said = run("convert", capture, tmp_path / "model", "--to", "colmap", "--depths", maps)
+    assert said.code == 0, said.err
+    points = open_capture(tmp_path / "model").points
+    assert points is not None and len(points.xyz) > 100
+    refused = run("convert", capture, tmp_path / "own", "--depths", maps)
+    assert_one_line(refused, "not PNG", "--format png")
+
+
+def test_maps_that_are_not_there_are_counted(run: Run, capture: Path, tmp_path: Path) -> None:
+    maps = write_maps(capture, tmp_path / "maps", depth=wall)
+    next((maps / "depth").iterdir()).unlink()
+    said = run("convert", capture, tmp_path / "out", "--depths", maps)
+    assert said.code == 0 and "1 map of the folder left out" in said.warnings[0]
+
+
+def test_maps_that_are_not_sure_are_told_with_what_convert_can_do(
+    run: Run, capture: Path, tmp_path: Path
+) -> None:
+    maps = write_maps(capture, tmp_path / "maps", depth=wall)
+    for file in (maps / "confidence").iterdir():
+        Image.new("L", SIZE[::-1], 30).save(file)
+    said = run("convert", capture, tmp_path / "out", "--depths", maps)
+    assert_one_line(said, "sure enough (0.4 or more)", "deltas check")
+    assert "--min-confidence" not in said.err  # which the command does not have
