@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
+from textwrap import shorten
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,6 +17,7 @@ from deltas_nets.config.baselines import BASELINES
 from deltas_nets.errors import UserError
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.networks import Network, build_network
+from deltas_nets.network.torch_file import check_finite_weights
 from deltas_nets.outputs.atomic_files import check_file, write_atomically
 
 DEFAULT = "deltas-small"
@@ -72,9 +74,15 @@ def weights_file(name_or_file: str | Path) -> Path:
     shipped = Path(str(files("deltas_nets") / "weights" / f"{name_or_file}.safetensors"))
     if file.suffix != ".safetensors" and shipped.is_file():
         return shipped
+    if file.is_dir():
+        inside = file / "weights.safetensors"
+        remedy = f"name {inside}" if inside.is_file() else "name a .safetensors file"
+        raise UserError("this is a folder, not weights", file, remedy)
     if not file.is_file():
-        known = ", ".join((DEFAULT, *BASELINES))
-        raise UserError("no such weights", file, f"name a .safetensors file or one of {known}")
+        known = f"one of {', '.join((DEFAULT, *BASELINES))}"
+        if str(name_or_file) in BASELINES:
+            known = f"{DEFAULT}: {file} has none"
+        raise UserError("no such weights", file, f"name a .safetensors file or {known}")
     return file
 
 
@@ -117,7 +125,7 @@ def load_weights(model: torch.nn.Module, file: Path) -> None:
     """Copy a file's weights into a model of the same shape.
 
     Raises:
-        UserError: a weight is missing, left over or of another shape.
+        UserError: a weight is missing, left over, of another shape, or no finite number.
     """
     _load(model, load_file(file), file)
 
@@ -131,8 +139,8 @@ def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
         Weights that the file lacks: they stay as they are.
 
     Raises:
-        UserError: a weight is left over or of another shape, or more than half are lacking: these
-            are another network's.
+        UserError: a weight is left over, of another shape or no finite number, or more than half
+            are lacking: these are another network's.
     """
     state = load_file(file)
     own = model.state_dict()
@@ -150,10 +158,18 @@ def start_from_weights(model: torch.nn.Module, file: Path) -> list[str]:
 
 
 def _load(model: torch.nn.Module, state: dict[str, Tensor], file: Path) -> None:
+    check_finite_weights(state, file)
+    own = model.state_dict()
+    for name, value in state.items():
+        # Copying would round: a file of whole numbers was made for another program.
+        if name in own and own[name].is_floating_point() and not value.is_floating_point():
+            what = f"{name} holds whole numbers ({value.dtype})"
+            raise UserError(what, file, "name the weights.safetensors that deltas train wrote")
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
         first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
+        first = shorten(first, 150, placeholder=" ...")  # it may name hundreds
         raise UserError(
             f"weights do not fit the network ({first})", file, "use the config they were trained by"
         ) from None

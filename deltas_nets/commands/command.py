@@ -17,6 +17,9 @@ class Command:
     groups: ClassVar[Mapping[str, Sequence[str]]] = {}
     """Options by title, as the help shows them; all in one where there are none."""
 
+    smaller: ClassVar[str] = "ask for less, or use a machine with more"
+    """What to do where memory does not suffice."""
+
     @property
     def going_on(self) -> str:
         """What to do after the command was stopped."""

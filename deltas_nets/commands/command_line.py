@@ -13,6 +13,7 @@ import tyro
 from deltas_nets import __version__
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.grouped_help import grouped_help
+from deltas_nets.commands.memory import lacking_memory
 from deltas_nets.commands.values import check_values
 from deltas_nets.commands.words import first_page, sentence
 from deltas_nets.errors import UserError
@@ -48,6 +49,11 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
         except KeyboardInterrupt:
             print(f"deltas: stopped; {command.going_on}", file=sys.stderr)
             sys.exit(130)
+        except Exception as error:
+            what = lacking_memory(error)
+            if what is None or command.debug:
+                raise
+            _fail(UserError(what, f"deltas {type(command).__name__.lower()}", command.smaller))
 
 
 def parse(arguments: Sequence[str], commands: Commands) -> Command:

@@ -7,8 +7,12 @@ from deltas_nets.terminal import warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
+    from deltas_nets.evaluate.scores import CaptureScores
 
-__all__ = ["warn_of", "without_effect"]
+__all__ = ["warn_of", "warn_of_unit", "without_effect"]
+
+FEW = 0.2
+"""Share of pixels that are right, or wrong, within a factor of nearly two."""
 
 
 def warn_of(name: str, capture: "Capture", maps: Path | None) -> None:
@@ -27,6 +31,16 @@ def warn_of(name: str, capture: "Capture", maps: Path | None) -> None:
     said = {} if maps is None else (read_summary(maps / SUMMARY) or {}).get("settings", {})
     if said.get("sensor_depth", {}).get("from") == "sensor":
         warn("the maps were made with the sensor depth that they are scored against")
+
+
+def warn_of_unit(scores: "CaptureScores") -> None:
+    """Warn where maps of any program are right but for a factor, as of another unit.
+
+    Poses whose scale is off by some per cent do not count.
+    """
+    as_they_are, scaled = scores.dense, scores.median_scaled
+    if as_they_are.delta3 < FEW and scaled.delta3 > 1 - FEW:
+        warn("the maps are right but for a factor: are they in metres, and PNG in millimetres?")
 
 
 def without_effect(

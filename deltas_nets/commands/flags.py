@@ -46,6 +46,8 @@ class Prediction(Command):
     debug: Flag = False
     """Show the traceback of an error."""
 
+    smaller = "lower --work-size, or use a machine with more"
+
     def predictor(self) -> "Predictor":
         """The network, where it is to run."""
         from deltas_nets.predict.predictor import load_predictor

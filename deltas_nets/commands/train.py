@@ -63,6 +63,7 @@ class Train(Command):
     """Show the traceback of an error."""
 
     going_on = "the same command with --resume goes on"
+    smaller = "raise --accumulate, or lower --batch-size, --sizes, --max-views or --num-keypoints"
 
     @classmethod
     def parsed_as(cls, arguments: Sequence[str]) -> Any:

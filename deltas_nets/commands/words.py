@@ -85,6 +85,12 @@ def _no_number(match: re.Match[str], _: Any) -> str:
     return f"{match['option']} takes {kind}, got {match['got']}"
 
 
+def _no_row(match: re.Match[str], _: Any) -> str:
+    got = " ".join(re.findall(r"'([^']*)'", match["got"]))
+    kinds = match["kinds"].replace("INT", "N").replace("FLOAT", "X")
+    return f"{match['option']} takes {kinds}, got {got or 'nothing'}"
+
+
 def _no_choice(match: re.Match[str], _: Any) -> str:
     *known, last = re.findall(r"'([^']*)'", match["known"])
     return f"{match['option']} takes {', '.join(known)} or {last}, got {match['got']}"
@@ -137,6 +143,12 @@ _SAYINGS: tuple[tuple[str, Callable[[re.Match[str], Any], str]], ...] = (
         r"Error parsing (?P<option>--[\w.-]+): could not convert string to (?P<kind>float): "
         r"'(?P<got>.*?)'",
         _no_number,
+    ),
+    (
+        r"Error parsing (?P<option>--[\w.-]+): Could not find valid parse for arguments: "
+        r"(?P<got>\[.*?\]); Argument helptext: (?P=option) "
+        r"\[(?P<kinds>[A-Z ]+\[[A-Z ]+\.\.\.\])\]",
+        _no_row,
     ),
     (
         r"invalid choice '(?P<got>.*?)' for argument '(?P<option>.*?)'\. Expected one of "

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.view_sets import ViewSet, check_frames
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
@@ -17,7 +18,7 @@ from deltas_nets.evaluate.points import score_keypoints
 from deltas_nets.evaluate.scores import CaptureScores, MapScores, mean_scores, score_map
 from deltas_nets.evaluate.truth import Truth, TruthSize
 from deltas_nets.outputs.depth_formats import read_depth_map
-from deltas_nets.outputs.summary import recorded_depth_scale
+from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale
 from deltas_nets.outputs.their_capture import in_their_unit
 from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, frames_of, resized
 from deltas_nets.predict.look import look
@@ -125,12 +126,23 @@ def evaluate_files(
         UserError: all frames fail, or no anchor has true depth in range.
     """
     scale = recorded_depth_scale(predictions)
+    ours = read_summary(predictions / SUMMARY) is not None
     capture = in_their_unit(capture, predictions)
 
     def read(views: ViewSet) -> _Scored:
-        return _Scored(read_depth_map(predictions, views.anchor, scale), None, None)
+        depth = read_depth_map(predictions, views.anchor, scale, ours=ours)
+        _check_upright(depth, capture.frame(views.anchor), predictions)
+        return _Scored(depth, None, None)
 
     return _evaluate(read, capture, view_sets, scoring or Scoring(), None, report)
+
+
+def _check_upright(depth: Map, frame: Frame, folder: Path) -> None:
+    """Refuse a map that lies where its photo stands: it would be squeezed to the truth's shape."""
+    (height, width), (rows, columns) = depth.shape, frame.image_size
+    if (height - width) * (rows - columns) < 0:
+        what = f"the map of frame {frame.id} is {width}x{height} and its photo {columns}x{rows}"
+        raise UserError(f"{what}: it is turned", folder / "depth", "write maps as photos lie")
 
 
 def _predicted(

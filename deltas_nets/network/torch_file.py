@@ -1,5 +1,7 @@
 """Files of torch that others wrote, or a killed machine cut: none of them ends in a traceback."""
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from deltas_nets.errors import UserError
 
-__all__ = ["read_state", "read_torch_file"]
+__all__ = ["check_finite_weights", "read_state", "read_torch_file"]
 
 NESTS = ("extractor", "state_dict", "model_state_dict", "model")
 """Keys under which some authors keep the weights in their files."""
@@ -44,7 +46,8 @@ def read_state(
     """The named tensors of a file.
 
     Raises:
-        UserError: the file is missing, or holds anything but tensors by name.
+        UserError: the file is missing, holds anything but tensors by name, or numbers that are not
+            finite.
     """
     content = read_torch_file(file, remedy=remedy)
     for name in NESTS:
@@ -52,9 +55,27 @@ def read_state(
             content = content[name]
     if not isinstance(content, dict):
         raise UserError("the file holds no weights by name", file, remedy)
-    return {name: value for name, value in content.items() if isinstance(value, Tensor)}
+    state = {name: value for name, value in content.items() if isinstance(value, Tensor)}
+    check_finite_weights(state, file)
+    return state
+
+
+def check_finite_weights(state: Mapping[str, Tensor], file: Path) -> None:
+    """Whether a network could compute with weights, of any shape: one NaN makes all depth NaN.
+
+    Raises:
+        UserError: some are NaN or infinite; the text names the first.
+    """
+    spoilt = [name for name, value in state.items() if not value.isfinite().all()]
+    if spoilt:
+        first = f"{spoilt[0]} and {len(spoilt) - 1} more" if len(spoilt) > 1 else spoilt[0]
+        remedy = "their training diverged, or the file is damaged: name others"
+        raise UserError(f"the weights are not finite ({first})", file, remedy)
 
 
 def _short(error: Exception) -> str:
     """The beginning of what torch says, which goes on for a page of advice."""
-    return shorten(str(error).partition("\n")[0], 150, placeholder=" ...")
+    # What it advises on weights_only is how to run what is in the file after all.
+    said = str(error).partition("\n")[0].partition(" In PyTorch 2.6")[0]
+    said = re.sub(r"`*weights_only(=True)?`*", "a reader that runs no code", said)
+    return shorten(said, 150, placeholder=" ...")

@@ -10,6 +10,7 @@ import math
 import os
 import re
 import secrets
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -54,6 +55,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         UserError: the system refuses, or a device or a pipe is there; nothing is left behind then.
     """
     _check_no_device(path)
+    outer = sys.exception()
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.deltas-tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,10 +68,26 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise cannot_write(path, error) from error
+        refusal = _refusal(error, outer)
+        if refusal is not None:
+            raise cannot_write(path, refusal) from error
         raise
     _sync_folder(path.parent)
+
+
+def _refusal(error: BaseException, outer: BaseException | None) -> OSError | None:
+    """The system's refusal behind an error: torch's, of a full disk, speaks of positions.
+
+    Args:
+        error: while a file was written.
+        outer: what was being handled before; None if nothing was.
+    """
+    behind: BaseException | None = error
+    while isinstance(behind, Exception) and behind is not outer:
+        if isinstance(behind, OSError):
+            return behind
+        behind = behind.__context__
+    return None
 
 
 def remove_temporary(files: Iterable[Path]) -> None:

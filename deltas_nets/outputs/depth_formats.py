@@ -31,6 +31,9 @@ __all__ = [
 MILLIMETRES = 1000.0  # steps in a metre
 MAKE_ANEW = "remove it and run deltas depth again"
 """What is there is kept by `deltas depth`, damaged or not."""
+NOT_MADE = "run deltas depth first"
+THEIRS = "write ID.png (16-bit millimetres), ID.npz (depth, metres), ID.tiff or ID.pfm (metres)"
+"""Of maps of another program."""
 MAX_STEPS = 65534  # 65535 means "none" to some readers
 RUNS = zlib.Z_RLE
 """How maps are compressed: a sixth of the time of the default, files of 8 % more to 10 % less."""
@@ -129,19 +132,37 @@ def _one_channel(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return depth
 
 
-def read_depth_map(folder: Path, id: str, scale: float) -> NDArray[np.float32]:
+def read_depth_map(
+    folder: Path, id: str, scale: float, *, ours: bool = True
+) -> NDArray[np.float32]:
     """The map of a frame, in whatever format a folder holds it.
 
+    Args:
+        folder: that has depth/ID.png, or another format.
+        id: of the frame.
+        scale: steps in a unit, of PNG.
+        ours: whether `deltas depth` wrote it, and can do so again.
+
     Raises:
-        UserError: there is none, or it cannot be read.
+        UserError: there is none, there are several, or it cannot be read.
     """
-    for name, kind in DEPTH_FORMATS.items():
-        file = folder / "depth" / f"{id}.{name}"
-        if file.exists():
-            try:
-                return _one_channel(kind.read(file, scale))
-            except (OSError, ValueError, KeyError, SyntaxError, BadZipFile, EOFError) as error:
-                what = f"the depth map cannot be read ({error})"
-                raise UserError(what, file, MAKE_ANEW) from error
-    file = folder / "depth" / f"{id}.png"
-    raise UserError("no depth map (No such file or directory)", file, "run deltas depth first")
+    named = ((folder / "depth" / f"{id}.{name}", kind) for name, kind in DEPTH_FORMATS.items())
+    found = [(file, kind) for file, kind in named if file.exists()]
+    if not found:
+        what = f"no depth map (No such file or directory{_beside(folder / 'depth')})"
+        raise UserError(what, folder / "depth" / f"{id}.png", NOT_MADE if ours else THEIRS)
+    file, kind = found[0]
+    if len(found) > 1:
+        names = " and ".join(file.name for file, _ in found)
+        raise UserError(f"a frame has several depth maps, {names}", file.parent, "keep one of them")
+    try:
+        return _one_channel(kind.read(file, scale))
+    except (OSError, ValueError, KeyError, SyntaxError, BadZipFile, EOFError) as error:
+        what = f"the depth map cannot be read ({error})"
+        raise UserError(what, file, MAKE_ANEW if ours else THEIRS) from error
+
+
+def _beside(folder: Path) -> str:
+    """What is there instead: names of another form, or a suffix that is not read."""
+    first = min((file.name for file in folder.iterdir()), default="") if folder.is_dir() else ""
+    return f"; {first} is there" if first else ""

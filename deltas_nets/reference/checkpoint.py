@@ -45,8 +45,8 @@ def load(*source: str | Path | Table, device: str | torch.device = "cpu") -> Ref
         device: where to put it.
 
     Raises:
-        UserError: the file cannot be read, or a weight is missing, left over or of another
-            shape.
+        UserError: the file cannot be read, or a weight is missing, left over, of another shape
+            or not finite.
         TypeError: neither one nor three sources.
 
     Example:
@@ -88,7 +88,7 @@ def check_table(parts: Sequence[nn.Module], table: Any, entry: str, where: str |
         where: the file it comes from, for errors.
 
     Raises:
-        UserError: a weight is missing, left over or of another shape.
+        UserError: a weight is missing, left over, of another shape or not finite.
     """
     if not isinstance(table, Mapping):
         raise UserError(f"no table {entry}", where, _REMEDY)
@@ -107,6 +107,8 @@ def check_table(parts: Sequence[nn.Module], table: Any, entry: str, where: str |
                 where,
                 _REMEDY,
             )
+        if not torch.as_tensor(table[key]).isfinite().all():
+            raise UserError(f"{key} of {entry} is not finite", where, _REMEDY)
     left = [key for key in table if key not in expected and not str(key).startswith(_UNUSED)]
     if left:
         raise UserError(f"{entry} holds {left[0]}, which no layer has", where, _REMEDY)

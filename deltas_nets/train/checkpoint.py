@@ -70,9 +70,18 @@ def load_config(folder: Path) -> TrainConfig:
     try:
         return from_dict(TrainConfig, json.loads(file.read_text(encoding="utf-8")))
     except FileNotFoundError:
+        if (folder / WEIGHTS).exists():
+            raise UserError("the run has no config", file, _from_weights(folder)) from None
         raise UserError("nothing to resume", folder, "name the --out of an earlier run") from None
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"config is not readable ({error})", file, "start a new run") from None
+        whole = (folder / WEIGHTS).exists()
+        remedy = _from_weights(folder) if whole else "start a new run"
+        raise UserError(f"config is not readable ({error})", file, remedy) from None
+
+
+def _from_weights(folder: Path) -> str:
+    """What to do where a file of a run is damaged: its weights stand in one of their own."""
+    return f"go on from its weights in a new folder: --init {folder / WEIGHTS}"
 
 
 def load_run(folder: Path, state: RunState) -> tuple[RunState, Provenance]:
@@ -87,7 +96,7 @@ def load_run(folder: Path, state: RunState) -> tuple[RunState, Provenance]:
     file = folder / CHECKPOINT
     if not file.exists():
         raise UserError("no checkpoint to resume", file, "start without --resume")
-    weights = f"go on from its weights in a new folder: --init {folder / WEIGHTS}"
+    weights = _from_weights(folder)
     content = read_torch_file(file, remedy=weights)
     if not isinstance(content, dict) or not content.keys() >= _IN_A_CHECKPOINT:
         raise UserError("this is no checkpoint of a training", file, weights)

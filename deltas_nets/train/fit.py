@@ -18,6 +18,7 @@ from deltas_nets.rooms import Rooms
 from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.checkpoint import WEIGHTS, save_run
 from deltas_nets.train.data_sets import training_data, validation_data
+from deltas_nets.train.first_frames import check_frames
 from deltas_nets.train.loader import step_loader
 from deltas_nets.train.log import FolderLog, RunLog
 from deltas_nets.train.optimiser import set_learning_rate
@@ -73,6 +74,7 @@ def fit(
     fabric = launch_fabric(config)
     tell = report if fabric.is_global_zero else _silently
     data, held_out = training_data(config, report=tell), validation_data(config, report=tell)
+    check_frames(data, held_out, DEPTH_RANGE, report=tell)
     state, provenance, teacher = starting_state(config, folder, start, fabric, tell)
     objective = Objective(state.model, config)
     wrapped, optimizer = fabric.setup(objective, state.optimizer)

@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deltas_nets.config import TrainConfig, to_dict
-from deltas_nets.outputs.atomic_files import plain, write_atomically
+from deltas_nets.outputs.atomic_files import cannot_write, plain, write_atomically
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -55,7 +56,7 @@ class FolderLog(RunLog):
     def __init__(
         self, folder: Path, config: TrainConfig, *, step: int, report: Callable[[str], None]
     ) -> None:
-        file = folder / LOG
+        self._place, file = folder, folder / LOG
         drop_later_entries(file, step)
         self.report = report
         self._validated = _validated_steps(file)
@@ -80,9 +81,10 @@ class FolderLog(RunLog):
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        self._file.close()
-        if self._curves is not None:
-            self._curves.close()
+        with suppress(OSError):  # each line was flushed, or its refusal told
+            self._file.close()
+            if self._curves is not None:
+                self._curves.close()
 
     def progress(self, step: int) -> None:
         """Move the bar."""
@@ -109,13 +111,20 @@ class FolderLog(RunLog):
         return step in self._validated
 
     def _write(self, entry: Mapping[str, object]) -> None:
-        print(json.dumps(plain(entry)), file=self._file, flush=True)
+        try:
+            print(json.dumps(plain(entry)), file=self._file, flush=True)
+        except OSError as error:
+            raise cannot_write(self._place / LOG, error) from error
 
     def _draw(self, group: str, values: Mapping[str, float], step: int) -> None:
-        if self._curves is not None:
+        if self._curves is None:
+            return
+        try:
             for name, value in values.items():
                 self._curves.add_scalar(f"{group}/{name}", value, step)
             self._curves.flush()
+        except OSError as error:
+            raise cannot_write(self._place / CURVES, error) from error
 
 
 def _validated_steps(file: Path) -> set[int]:

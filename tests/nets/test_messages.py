@@ -90,6 +90,8 @@ COMMANDS = (
     "train --steps abc",
     "train --out OUT --steps 0",
     "train --out OUT --sizes 10 10",
+    "train --out OUT --sizes 96 128 96",
+    "train --out OUT --network.densifier-widths wide",
     "train --out OUT --learning-rate nan",
     "train --out OUT --learning-rate 0",
     "train --out OUT --data.workers -1",

@@ -86,6 +86,12 @@ def test_given_weights_are_copied(tables: Tables) -> None:
         ),
         ("state_dict", "fc.weight", torch.zeros(2), r"state_dict holds fc\.weight, which no layer"),
         ("state_dict", "convPb.bias", "text", r"convPb\.bias of state_dict is a str"),
+        (
+            "state_dict_depth",
+            "conv_final.bias",
+            torch.full((1,), torch.nan),
+            r"conv_final\.bias of state_dict_depth is not finite",
+        ),
     ],
 )
 def test_damaged_tables_are_named(

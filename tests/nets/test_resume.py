@@ -106,6 +106,18 @@ def test_a_config_that_is_none_is_refused_in_a_line(
     assert_one_line(run("train", "--out", folder, "--resume"), "config is not readable")
 
 
+@pytest.mark.parametrize("content", ["{", None])
+def test_a_run_without_its_config_leaves_its_weights(
+    folder: Path, run: Run, content: str | None
+) -> None:
+    (folder / "weights.safetensors").touch()
+    (folder / "config.json").unlink()
+    if content is not None:
+        (folder / "config.json").write_text(content)
+    remedy = f"config.json: go on from its weights in a new folder: --init {folder}/weights."
+    assert_one_line(run("train", "--out", folder, "--resume"), remedy)
+
+
 def test_no_other_config_continues_a_run(folder: Path) -> None:
     check_continues(folder, replace(TINY, devices=1))
     with pytest.raises(UserError, match="seed 1, not 0"):

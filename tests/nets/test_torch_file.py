@@ -66,6 +66,7 @@ def test_a_wrong_file_is_refused_in_a_line(tmp_path: Path, reader: str, wrong: s
         READERS[reader](file)
     assert str(tmp_path) in str(caught.value)
     assert len(caught.value.what) < 200
+    assert "weights_only" not in str(caught.value)
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -79,3 +80,9 @@ def test_weights_are_found_where_authors_keep_them(tmp_path: Path) -> None:
     torch.save({"epoch": 3, "state_dict": MANY | {"note": "x"}}, tmp_path / "file.pt")
     state = read_state(tmp_path / "file.pt")
     assert state.keys() == MANY.keys() and torch.equal(state["a"], MANY["a"])
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    torch.save(MANY | {"b": torch.tensor([0.0, float("inf")])}, tmp_path / "file.pt")
+    with pytest.raises(UserError, match=r"the weights are not finite \(b\), .*file.pt"):
+        read_state(tmp_path / "file.pt")

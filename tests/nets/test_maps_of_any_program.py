@@ -1,0 +1,67 @@
+"""Maps that another program wrote, scored: what is not as it has to be is told, not scored."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from run_command import Result, Run, assert_one_line
+from small_capture import write_capture
+
+Score = Callable[[], Result]
+DEPTH = np.full((48, 64), 2.5, np.float32)  # m, as the capture's
+STEPS = DEPTH.astype(np.uint16)
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """A folder for the map of frame 1."""
+    write_capture(tmp_path / "capture", 3)
+    (tmp_path / "sets.json").write_text('[{"anchor": 1, "sources": [0]}]')
+    (tmp_path / "maps" / "depth").mkdir(parents=True)
+    return tmp_path / "maps" / "depth"
+
+
+@pytest.fixture
+def score(maps: Path, run: Run, tmp_path: Path) -> Score:
+    asked = ("--predictions", maps.parent, "--view-sets", tmp_path / "sets.json")
+    return lambda: run("evaluate", tmp_path / "capture", *asked)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (24, 32), (60, 61), (60, 60)])
+def test_a_map_of_another_size_is_scored(maps: Path, score: Score, shape: tuple[int, int]) -> None:
+    np.savez(maps / "1.npz", depth=np.full(shape, 2.5, np.float32))
+    told = score()
+    assert told.code == 0 and not told.err
+
+
+def test_a_turned_map_is_not(maps: Path, score: Score) -> None:
+    np.savez(maps / "1.npz", depth=DEPTH.T)
+    assert_one_line(score(), "map of frame 1 is 48x64 and its photo 64x48: it is turned")
+
+
+def test_a_frame_has_one_map(maps: Path, score: Score) -> None:
+    np.savez(maps / "1.npz", depth=DEPTH)
+    Image.fromarray(1000 * STEPS).save(maps / "1.png")
+    assert_one_line(score(), "a frame has several depth maps, 1.png and 1.npz")
+
+
+@pytest.mark.parametrize("factor", [1000, 0.001])
+def test_another_unit_is_warned_of(maps: Path, score: Score, factor: float) -> None:
+    np.savez(maps / "1.npz", depth=factor * DEPTH)
+    told = score()
+    assert told.code == 0 and "the maps are right but for a factor" in told.err
+
+
+@pytest.mark.parametrize("name", ["000001.npz", "1.npy"])
+def test_maps_of_another_name_are_told_how_to_be_written(
+    maps: Path, score: Score, name: str
+) -> None:
+    (maps / name).touch()
+    assert_one_line(score(), f"{name} is there", "write ID.png (16-bit millimetres), ID.npz")
+
+
+def test_maps_of_another_kind_are_told_how_to_be_written(maps: Path, score: Score) -> None:
+    Image.fromarray(STEPS.astype(np.uint8)).save(maps / "1.png")
+    assert_one_line(score(), "16 bits of one channel", "write ID.png (16-bit millimetres), ID.npz")
