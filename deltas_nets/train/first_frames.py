@@ -2,14 +2,18 @@
 
 from collections.abc import Callable
 
+import numpy as np
 from torch.utils.data import Dataset, Subset
 
+from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.posed_images import PosedImages
+from deltas_nets.captures.work_size import SMALLEST_BASELINE
 from deltas_nets.datasets.scannet import ScanNetViewSets
 from deltas_nets.errors import UserError
 
-__all__ = ["check_frames", "check_true_depth"]
+__all__ = ["check_frames", "check_parallax", "check_true_depth"]
 
 Report = Callable[[str], None]
 LOOKED_AT = 16
@@ -32,10 +36,11 @@ def check_frames(
         report: gets warnings.
 
     Raises:
-        UserError: there is no depth in this range.
+        UserError: there is no depth in this range, or no camera moves.
     """
     if not isinstance(data, ScanNetViewSets):
         return
+    check_parallax(data, report=report)
     check_true_depth(data, depth_range, report=report)
     if held_out is not None and isinstance(held_out.dataset, ScanNetViewSets):
         check_true_depth(held_out.dataset, depth_range, report=report)
@@ -44,6 +49,31 @@ def check_frames(
         if both:
             scenes = f"{len(both)} of {len(held_out.dataset.scenes)} scenes ({ids_in_words(both)})"
             report(f"warning: {scenes} of --data.validation are trained on, too: no held-out ones")
+
+
+def check_parallax(data: ScanNetViewSets, *, report: Report = lambda _: None) -> None:
+    """Look at the poses of all scenes: a camera that stands sees no depth.
+
+    Args:
+        data: view sets of scenes.
+        report: gets a warning where some of the cameras stand.
+
+    Raises:
+        UserError: all of them do.
+    """
+    still = [name for name, scene in data.scenes if _stands(scene)]
+    if len(still) == len(data.scenes):
+        what = f"the camera stands in one place in all {len(still)} scenes, and shows no parallax"
+        remedy = "poses are camera-to-world, in metres: check what wrote them"
+        raise UserError(what, dict(data.scenes)[still[0]].path / "pose", remedy)
+    if still:
+        scenes = f"{len(still)} of {len(data.scenes)} scenes ({ids_in_words(still)})"
+        report(f"warning: the camera stands in one place in {scenes}, which teach no matching")
+
+
+def _stands(scene: Capture) -> bool:
+    centres = camera_centres(scene.frames.cam_from_world)
+    return bool(np.ptp(centres, axis=0).max() < SMALLEST_BASELINE)
 
 
 def check_true_depth(

@@ -12,7 +12,7 @@ from torch.utils.data import Subset
 
 from deltas_nets.config.scannet import ScanNetConfig
 from deltas_nets.errors import UserError
-from deltas_nets.train.first_frames import check_frames, check_true_depth
+from deltas_nets.train.first_frames import check_frames, check_parallax, check_true_depth
 from deltas_nets.train.fit import Start, fit
 
 RANGE = (0.5, 10.0)
@@ -73,3 +73,27 @@ def test_scenes_that_are_trained_and_validated_on_are_named(scannet_root: Path) 
     check_frames(learned, Subset(all_of_them, [0]), RANGE, report=said.append)
     (warning,) = said
     assert "2 of 3 scenes (scene0000_00, scene0706_01) of --data.validation" in warning
+
+
+def stand_still(scene: Path) -> None:
+    for file in scene.glob("pose/*.txt"):
+        pose = np.loadtxt(file)
+        pose[:3, 3] = 1.0
+        file.unlink()
+        np.savetxt(file, pose)
+
+
+def test_cameras_that_all_stand_are_refused_and_some_are_named(
+    scannet_copy: Path, tmp_path: Path
+) -> None:
+    first, *others = sorted(scannet_copy.glob("scans/*"))
+    stand_still(first)
+    said: list[str] = []
+    check_parallax(opened(ScanNetConfig(root=str(scannet_copy), gap=2)), report=said.append)
+    (warning,) = said
+    assert f"in one place in 1 of 2 scenes ({first.name})" in warning
+    for scene in others:
+        stand_still(scene)
+    with pytest.raises(UserError, match="one place in all 2 scenes"):
+        fit(tiny(scannet_copy), tmp_path / "run", Start())
+    assert not (tmp_path / "run").exists()
