@@ -64,19 +64,20 @@ def normal_matrix(
 
 def _terms_at_hand(x: Tensor, y: Tensor, squared: Tensor | None) -> Tensor:
     """What the coefficients belong to, in NumPy: without joining parts, and without threads."""
-    views, values = x.shape[-2], [t.numpy() for t in (x, y, squared) if t is not None]
+    views, values = x.shape[-2], [t.detach().numpy() for t in (x, y, squared) if t is not None]
     shape = np.broadcast_shapes(*(v.shape for v in values))
     terms = np.empty((*shape[:-2], 3 * views + (1 if squared is None else views), shape[-1]))
     square, across, down = (terms[..., k * views : (k + 1) * views, :] for k in range(3))
-    if squared is None:
-        across[...], down[...], terms[..., 3 * views :, :] = *values, 1.0
-    else:
-        weight = terms[..., 3 * views :, :]
-        weight[...] = values[2]
-        np.multiply(values[0], weight, out=across)
-        np.multiply(values[1], weight, out=down)
-    np.multiply(values[0], across, out=square)
-    square += values[1] * down
+    with np.errstate(all="ignore"):
+        if squared is None:
+            across[...], down[...], terms[..., 3 * views :, :] = *values, 1.0
+        else:
+            weight = terms[..., 3 * views :, :]
+            weight[...] = values[2]
+            np.multiply(values[0], weight, out=across)
+            np.multiply(values[1], weight, out=down)
+        np.multiply(values[0], across, out=square)
+        square += values[1] * down
     return torch.from_numpy(terms)
 
 

@@ -103,9 +103,10 @@ class Equations(NamedTuple):
 
 def _ahead_at_hand(row: Tensor, unused: Tensor, points: Vector3) -> Tensor:
     """Depth above 0 in all used views, in NumPy, which starts no threads."""
-    place = np.stack([points[0].numpy(), points[1].numpy(), points[2].numpy()], axis=-2)
-    depth = product(row[..., :3], torch.from_numpy(place)).numpy()
-    ahead = (depth > -row[..., 3:].numpy()) | unused.numpy()
+    place = np.stack([axis.detach().numpy() for axis in points], axis=-2)
+    with np.errstate(all="ignore"):  # what has failed may be anywhere
+        depth = product(row[..., :3], torch.from_numpy(place)).numpy()
+        ahead = (depth > -row[..., 3:].detach().numpy()) | unused.numpy()
     return torch.from_numpy(ahead.all(axis=-2))
 
 

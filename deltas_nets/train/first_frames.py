@@ -62,7 +62,7 @@ def check_parallax(data: ScanNetViewSets, *, report: Report = lambda _: None) ->
         UserError: all of them do.
     """
     still = [name for name, scene in data.scenes if _stands(scene)]
-    if len(still) == len(data.scenes):
+    if still and len(still) == len(data.scenes):
         what = f"the camera stands in one place in all {len(still)} scenes, and shows no parallax"
         remedy = "poses are camera-to-world, in metres: check what wrote them"
         raise UserError(what, dict(data.scenes)[still[0]].path / "pose", remedy)
@@ -73,7 +73,7 @@ def check_parallax(data: ScanNetViewSets, *, report: Report = lambda _: None) ->
 
 def _stands(scene: Capture) -> bool:
     centres = camera_centres(scene.frames.cam_from_world)
-    return bool(np.ptp(centres, axis=0).max() < SMALLEST_BASELINE)
+    return len(centres) > 0 and bool(np.ptp(centres, axis=0).max() < SMALLEST_BASELINE)
 
 
 def check_true_depth(

@@ -1,6 +1,7 @@
 """Values at hand are weighed in NumPy as tensors are in torch; their points start no threads."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -106,3 +107,19 @@ def test_a_batch_that_weights_alone_have_is_kept() -> None:
     for one, weight in zip(found, weights, strict=True):
         alone = triangulate_points(scene.views.proj.float(), scene.pixels.float(), weight)
         np.testing.assert_allclose(one, alone, rtol=1e-6)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_what_fails_is_told_by_its_status_and_by_no_warning_of_numpy(weighted: bool) -> None:
+    scene = seeded_scene(0, num_views=3, num_points=300)
+    proj = scene.views.proj.float()[:1].expand(3, 3, 4)  # one camera, three times
+    pixels = scene.pixels.float().clone()
+    pixels[0, :100] = math.inf
+    pixels[:, 100:200] = 1e18
+    weights = torch.rand(3, 300).clamp(min=1e-30) if weighted else None
+    if weights is not None:
+        weights[1, ::7] = math.inf
+        weights[2, ::5] = math.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.isfinite(triangulate_points(proj, pixels, weights)).all()
