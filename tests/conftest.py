@@ -1,5 +1,6 @@
 """What all tests share: hypothesis profiles, the dtypes, the real captures."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -31,6 +32,14 @@ torch.set_num_threads(1)
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, share)))
+# The half million objects of imports and tests never go, and are not to be looked through again.
+gc.set_threshold(10_000, 20, 20)
+
+
+def pytest_collection_finish() -> None:
+    """The tests are there, and stay."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
