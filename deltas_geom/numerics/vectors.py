@@ -5,12 +5,17 @@ never raises and compiles. Components broadcast.
 """
 
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import values_at_hand
 
+Array = NDArray[Any]
+Numbers = TypeVar("Numbers", Tensor, Array)
+"""What is written once for torch and NumPy."""
 Vector3 = tuple[Tensor, ...]
 """x y z."""
 Vector4 = tuple[Tensor, ...]

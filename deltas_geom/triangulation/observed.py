@@ -21,8 +21,7 @@ from deltas_geom.numerics.arithmetic import (
 )
 from deltas_geom.numerics.sums import plain, product
 from deltas_geom.numerics.vectors import Vector3
-from deltas_geom.triangulation.weighed import weigh_at_hand
-from deltas_geom.triangulation.weights import Weights, weigh
+from deltas_geom.triangulation.weights import Weights, weigh, weigh_at_hand
 
 _DIMS = {
     "proj": "+V 3 4",

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from deltas_geom.numerics.vectors import Array
 from deltas_geom.triangulation.dlt import rows
 from deltas_geom.triangulation.judge import REASONS
 from deltas_geom.triangulation.observed import Cameras
-from deltas_geom.triangulation.weighed import Weighed, weigh_at_hand
+from deltas_geom.triangulation.weights import Weighed, weigh_at_hand
 
-Array = NDArray[Any]
 FEW = 256
 """Points up to which this is the shorter way."""
 _POLISH = 2

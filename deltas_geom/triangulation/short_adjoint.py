@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from deltas_geom.numerics.vectors import Array
 from deltas_geom.triangulation.adjoint import through_centers, through_frame
-from deltas_geom.triangulation.short import Array, ShortRig, Solved
+from deltas_geom.triangulation.short import ShortRig, Solved
 
 
 def gradients(

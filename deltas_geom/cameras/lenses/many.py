@@ -14,11 +14,10 @@ itself is distorted, by a prism behind the lens, that is undone first.
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom.cameras.lenses.closed import Coefficients, Seen
@@ -26,8 +25,8 @@ from deltas_geom.cameras.lenses.models import Model
 from deltas_geom.cameras.lenses.tables import Table, table_of
 from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_geom.numerics.chunks import alike
+from deltas_geom.numerics.vectors import Array
 
-Array = NDArray[Any]
 MANY = 32768
 """Pixels from which on a table is worth being made."""
 _CHUNK = 25600
