@@ -64,6 +64,11 @@ def either(where: Tensor, a: Sequence[Tensor], b: Sequence[Tensor | float]) -> t
     return tuple([torch.where(where, p, q) for p, q in zip(a, b, strict=True)])
 
 
+def matrix3(*entries: Tensor) -> Tensor:
+    """``(*B, 3, 3)`` from nine ``(*B)``, row by row."""
+    return torch.stack(entries, dim=-1).reshape(*entries[0].shape, 3, 3)
+
+
 def as_one(parts: Sequence[Tensor], dtype: torch.dtype) -> Tensor:
     """Components ``(*B, N)`` as vectors ``(*B, N, K)`` in a dtype."""
     derived = torch.is_grad_enabled() and any(part.requires_grad for part in parts)

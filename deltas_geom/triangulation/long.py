@@ -16,12 +16,7 @@ from deltas_geom.triangulation.adjoint import gradients_of
 from deltas_geom.triangulation.equations import Equations, Frame, Rig, alike_of, equations_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.observed import observe
-from deltas_geom.triangulation.reprojection import (
-    mean_of,
-    parallax_of,
-    reproject,
-    squared_errors,
-)
+from deltas_geom.triangulation.reprojection import mean_of, parallax_of, reproject, squared_errors
 from deltas_geom.triangulation.solution import follow_linear, in_world, kept, solve_linear
 from deltas_geom.triangulation.uncertainty import covariance_of, representable, unscaled
 

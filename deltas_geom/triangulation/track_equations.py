@@ -86,9 +86,7 @@ def pose_tracks(
     sums = (
         summed(at(moments, camera_index) * times, point_index, num_points).unbind()
         for moments, times in zip(
-            camera_moments(centers, datum, broken),
-            (weighed.squared, weighed.used),
-            strict=True,
+            camera_moments(centers, datum, broken), (weighed.squared, weighed.used), strict=True
         )
     )
     frame = rig_frame(*sums, eps=torch.finfo(proj.dtype).eps)

@@ -13,7 +13,7 @@ from deltas_geom.numerics.arithmetic import (
     without_autocast,
 )
 from deltas_geom.numerics.symmetric3 import inverse3
-from deltas_geom.numerics.vectors import Symmetric3, Vector3
+from deltas_geom.numerics.vectors import Symmetric3, Vector3, matrix3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     cameras_of,
@@ -247,7 +247,7 @@ def unpacked3(entries: Sequence[Tensor]) -> Tensor:
     """Symmetric matrices ``(*B, N, 3, 3)`` from six ``(*B, N)``."""
     xx, xy, xz, yy, yz, zz = entries
     # Not an index: it would be copied to the device.
-    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(*xx.shape, 3, 3)
+    return matrix3(xx, xy, xz, xy, yy, yz, xz, yz, zz)
 
 
 def unscaled(entries: Sequence[Tensor], largest: Tensor) -> Tensor:

@@ -96,10 +96,7 @@ MODELS: dict[str, Model] = {
     "RADIAL_FISHEYE": _angles("k1 k2", 1, radial="k1 k2"),
     "OPENCV_FISHEYE": _angles("k1 k2 k3 k4", radial="k1 k2 k3 k4"),
     "THIN_PRISM_FISHEYE": _angles(
-        "k1 k2 p1 p2 k3 k4 sx1 sy1",
-        radial="k1 k2 k3 k4",
-        tangential=_TANGENTIAL,
-        prism="sx1 sy1",
+        "k1 k2 p1 p2 k3 k4 sx1 sy1", radial="k1 k2 k3 k4", tangential=_TANGENTIAL, prism="sx1 sy1"
     ),
     # Source: https://facebookresearch.github.io/projectaria_tools, "Fisheye624".
     "RAD_TAN_THIN_PRISM_FISHEYE": _angles(
