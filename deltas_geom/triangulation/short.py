@@ -46,8 +46,7 @@ class ShortRig(NamedTuple):
 
     def cameras(self) -> Cameras:
         """For the long way."""
-        known = map(torch.from_numpy, (self.proj, self.inverse, self.centers))
-        proj, inverse, centers = known
+        proj, inverse, centers = map(torch.from_numpy, (self.proj, self.inverse, self.centers))
         return Cameras(proj, torch.from_numpy(~self.finite).double(), inverse, centers)
 
 

@@ -1,5 +1,6 @@
 """Weighted, masked n-view DLT triangulation; every point carries a Status."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -174,10 +175,7 @@ class Call:
             found = self.way.adjoint(gradients[0], needed, *tensors[1:])
             return (*map(_shaped_as, found, tensors), None)
 
-        def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
-            return self.way.points(*seen)
-
-        return self._computed(derivable, values, (-2,), adjoint)[0]
+        return self._computed(derivable, self.way.points, (-2,), adjoint)[0]
 
     def full(self, *, covariance: bool) -> Triangulation:
         """Points with all that is known about them."""
@@ -187,9 +185,7 @@ class Call:
                 *seen, covariance=covariance, derivable=True
             )
 
-        def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
-            return self.way.full(*seen, covariance=covariance)
-
+        values = partial(self.way.full, covariance=covariance)
         dims = (-2, -1, -1, -1, -1, *([-3] if covariance else []), -1)
         found = self._computed(derivable, values, dims)
         points, depth, residual, parallax, errors, *noise, status = found
@@ -205,7 +201,11 @@ class Call:
     ) -> tuple[Tensor, ...]:
         serial = self.at_hand and adjoint is not None and self.dtype == torch.float32
         cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs, serial=serial)
-        return recomputed(function, *self.tensors, values=values, cut=cut, adjoint=adjoint)
+
+        def of_seen(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
+            return values(*seen)
+
+        return recomputed(function, *self.tensors, values=of_seen, cut=cut, adjoint=adjoint)
 
 
 def _at_hand(tensor: Tensor | None) -> bool:
