@@ -4,7 +4,7 @@ Source: COLMAP's src/colmap/sensor/models.h states each model; OPENCV_THIN_PRISM
 twelve coefficients, for which COLMAP has no name.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -108,10 +108,3 @@ MODELS: dict[str, Model] = {
     "EQUIRECTANGULAR": _closed("", 2, closed.panorama_pixels, closed.panorama_rays),
 }
 """COLMAP writes width and height in place of the focal lengths of EQUIRECTANGULAR."""
-
-
-def names_like(name: str) -> Sequence[str]:
-    """The name of the table nearest to one that is not in it."""
-    import difflib
-
-    return difflib.get_close_matches(name.upper().replace("-", "_"), MODELS, n=1, cutoff=0.4)
