@@ -96,14 +96,9 @@ class Segments(Record):
 
 
 def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
-    """How the anchor's pixels move through the sources with inverse depth.
+    """How the anchor's pixels ``(*B, N, 2)`` move through the sources with inverse depth.
 
-    Args:
-        views: the anchor (view 0) and its V-1 sources.
-        pixels: ``(*B, N, 2)`` keypoints of the anchor.
-
-    Raises:
-        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
+    Raises as :func:`epipolar_segments`.
     """
     cameras, posed, batch = finite_views(views)
     check_shapes(K=(cameras[0], "+V 3 3"), pixels=(pixels, "N 2"))

@@ -144,15 +144,7 @@ def equations_of(
     dtype: torch.dtype,
     alike: Alike | None = None,
 ) -> Equations:
-    """The equations of what cameras see.
-
-    Args:
-        rig: of the cameras.
-        observed: pixels and weights.
-        frame: "rig" or "world".
-        dtype: of the inputs.
-        alike: of points without weights and mask.
-    """
+    """The equations of what cameras see; ``dtype`` of the inputs, ``alike`` where points are."""
     x, y, weights = observed
     if alike is None:
         framed = _framed(rig, rig_sums(rig.moments, weights), frame, dtype)

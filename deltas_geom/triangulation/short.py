@@ -119,15 +119,9 @@ def solve(
     fixed: bool,
     dtype: np.dtype[Any],
 ) -> Solved:
-    """Points of pixels ``(*B, V, N, 2)``, weights and mask ``(*B, V, N)``.
+    """Points of pixels ``(*B, V, N, 2)``, with weights and mask as of :func:`weigh`.
 
-    Args:
-        rig: of the cameras.
-        pixels: those of unused views may hold anything.
-        weights: 0 = unused; the sign has no effect. NaN counts as used.
-        mask: True = used.
-        fixed: solve in the world's frame.
-        dtype: of the inputs.
+    ``fixed``: in the world's frame; ``dtype``: of the inputs.
     """
     with np.errstate(all="ignore"):
         seen, share, largest, used, sound = _observed(pixels, weights, mask)

@@ -115,15 +115,7 @@ class KnownCameras:
 
 
 class Call:
-    """One triangulation: how it is computed, and how it is derived.
-
-    Args:
-        known: the cameras.
-        pixels: ``(*B, V, N, 2)``.
-        weights: ``(*B, V, N)`` or None.
-        mask: ``(*B, V, N)`` or None.
-        frame: in which points are solved.
-    """
+    """One triangulation, with arguments of :func:`triangulate`: how it is computed and derived."""
 
     def __init__(
         self,

@@ -111,13 +111,9 @@ def _shares(
 
 
 def weigh_listed(weights: Tensor, point: Tensor, count: int, *, sound: Tensor) -> Weights:
-    """The same of a list of observations, all fields ``(T)`` but ``sound`` and ``largest`` ``(N)``.
+    """The same of a list of observations ``(T)`` of N points, whose index is ``point``.
 
-    Args:
-        weights: ``(T)``, in the solver's type.
-        point: ``(T)`` index of each observation's point.
-        count: N.
-        sound: ``(T)`` bool.
+    All fields are ``(T)`` but ``sound`` and ``largest`` ``(N)``.
     """
     size = weights.detach().abs()
     sound = sound & (size < math.inf)  # NaN is not
