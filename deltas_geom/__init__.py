@@ -6,11 +6,7 @@ Conventions: OpenCV axes, ``cam_from_world``, pixel centres at integers, metres.
 
 from deltas_geom.cameras.homogeneous import from_homogeneous, to_homogeneous
 from deltas_geom.cameras.lenses.lens import Lens, LensPixels, LensRays
-from deltas_geom.cameras.lenses.undistort import (
-    UndistortedImage,
-    undistort_image,
-    undistort_pixels,
-)
+from deltas_geom.cameras.lenses.undistort import UndistortedImage, undistort_image, undistort_pixels
 from deltas_geom.cameras.pixels import (
     crop_intrinsics,
     in_image,

@@ -95,13 +95,8 @@ def tensors_of(values: Any) -> list[Tensor]:
     """All tensors in a nest of tuples, in order."""
     if isinstance(values, Tensor):
         return [values]
-    found: list[Tensor] = []
-    for value in values if isinstance(values, tuple) else ():
-        if isinstance(value, Tensor):
-            found.append(value)
-        elif isinstance(value, tuple):
-            found += tensors_of(value)
-    return found
+    parts = values if isinstance(values, tuple) else ()
+    return [tensor for part in parts for tensor in tensors_of(part)]
 
 
 def _described(value: Any, name: str = "") -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from deltas_geom.checks import batch_shape, check_image_size, check_shapes
 from deltas_geom.numerics.arithmetic import numbers_or_zero, values_at_hand, without_autocast
+from deltas_geom.numerics.vectors import matrix3
 
 
 def pixel_grid(
@@ -91,15 +92,8 @@ def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, T
     """What :func:`normalize_pixels` gives to pixel (0, 0), and its slope, each ``(2,)``."""
     # What a mode of torch makes, as a fake tensor, is not to be kept.
     if values_at_hand(like) and torch._C._len_torch_dispatch_stack() == 0:
-        return _kept_normalizing(*image_size, like.dtype)
+        return _kept_normalizing(*image_size, like.device, like.dtype)
     return _normalizing(*image_size, like.device, like.dtype)
-
-
-@lru_cache(maxsize=64)
-def _kept_normalizing(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """The same on the CPU, where to make four numbers takes longer than to use them."""
-    with torch.inference_mode(False):  # whose tensors no later gradient could use
-        return _normalizing(height, width, torch.device("cpu"), dtype)
 
 
 def _normalizing(
@@ -109,6 +103,11 @@ def _normalizing(
     slope = torch.linspace(2 / width, 2 / height, 2, device=device, dtype=dtype)
     at_zero = torch.linspace(1 / width - 1, 1 / height - 1, 2, device=device, dtype=dtype)
     return at_zero, slope
+
+
+# On the CPU, where to make four numbers takes longer than to use them; not of inference mode, whose
+# tensors no later gradient could use.
+_kept_normalizing = lru_cache(maxsize=64)(torch.inference_mode(False)(_normalizing))
 
 
 @without_autocast
@@ -126,6 +125,12 @@ def resize_pixels(
     # As above: numbers of the host would be waited for.
     scale = torch.linspace(along_x, along_y, 2, device=pixels.device, dtype=pixels.dtype)
     return scale * (pixels + 0.5) - 0.5
+
+
+def intrinsics(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Tensor:
+    """K ``(*B, 3, 3)`` without skew, from four ``(*B)``."""
+    none = torch.zeros_like(fx)
+    return matrix3(fx, none, cx, none, fy, cy, none, none, torch.ones_like(fx))
 
 
 @without_autocast

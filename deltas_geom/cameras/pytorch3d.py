@@ -3,17 +3,14 @@
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.pixels import intrinsics
 from deltas_geom.checks import check_batch, check_image_size
 from deltas_geom.numerics.arithmetic import promoted, without_autocast
 
 
 @without_autocast
 def from_pytorch3d(
-    R: Tensor,
-    T: Tensor,
-    focal_length: Tensor,
-    principal_point: Tensor,
-    image_size: tuple[int, int],
+    R: Tensor, T: Tensor, focal_length: Tensor, principal_point: Tensor, image_size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """K ``(*B, V, 3, 3)`` and ``cam_from_world`` of :meth:`PosedViews.from_pytorch3d`."""
     check_image_size(image_size)
@@ -32,10 +29,8 @@ def from_pytorch3d(
     shorter = min(image_size) / 2  # px of a unit of NDC
     fx, fy = (shorter * focal).unbind(dim=-1)
     left, up = (shorter * principal).unbind(dim=-1)
-    none, one = torch.zeros_like(fx), torch.ones_like(fx)
     # Half of the width is the middle counted from the corner; our centres are at integers.
     cx, cy = (width - 1) / 2 - left, (height - 1) / 2 - up
-    K = torch.stack([fx, none, cx, none, fy, cy, none, none, one], dim=-1)
     x, y, z = torch.cat([R.mT, T.unsqueeze(-1)], dim=-1).unbind(dim=-2)
-    last = torch.stack([none, none, none, one], dim=-1)
-    return K.reshape(*fx.shape, 3, 3), torch.stack([-x, -y, z, last], dim=-2)
+    last = torch.eye(4, device=z.device, dtype=z.dtype)[3].expand_as(z)
+    return intrinsics(fx, fy, cx, cy), torch.stack([-x, -y, z, last], dim=-2)

@@ -265,9 +265,7 @@ class PosedViews(Record):
                 raise ValueError(f"{wanted}: not so in view {int((~good).nonzero()[0, -2])}")
 
 
-def finite_views(
-    views: PosedViews,
-) -> tuple[tuple[Tensor, Tensor], Tensor | None, torch.Size]:
+def finite_views(views: PosedViews) -> tuple[tuple[Tensor, Tensor], Tensor | None, torch.Size]:
     """Cameras to compute with: an identity, without gradient, in place of what is not finite.
 
     Nor is a camera whose numbers are so large that a product of four has none.

@@ -9,13 +9,7 @@ from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.cameras.views import PosedViews
 from deltas_geom.checks import ShapeError, check_batch, check_kind, check_positive
 from deltas_geom.diagnosis.causes import Cause
-from deltas_geom.diagnosis.evidence import (
-    CHANCE,
-    SHARE,
-    Evidence,
-    displacements,
-    gather_evidence,
-)
+from deltas_geom.diagnosis.evidence import CHANCE, SHARE, Evidence, displacements, gather_evidence
 from deltas_geom.diagnosis.hypotheses import Hypothesis, pixels_at, resized, shifted
 from deltas_geom.diagnosis.results import Diagnosis
 from deltas_geom.diagnosis.telling import Told
@@ -78,10 +72,6 @@ def diagnose(
         True
     """
     seen = _checked(views, pixels, mask, threshold)
-    return _diagnosed(views, pixels, seen, threshold)
-
-
-def _diagnosed(views: PosedViews, pixels: Tensor, seen: Tensor, threshold: float) -> Diagnosis:
     K, pose = (tensor.detach().cpu().double() for tensor in views)
     where = pixels.detach().cpu().double().nan_to_num()
     evidence = gather_evidence(where, seen)

@@ -89,7 +89,8 @@ class Told(NamedTuple):
 
     def _sentence(self, what: Hypothesis, before: float, after: float, moves: bool) -> str:
         off = int((self.given.residual > 3 * before + 1).sum())
-        worst = self.cameras.nan_to_num(-1.0).argsort(descending=True)[:3].tolist()
+        order = self.cameras.argsort(descending=True)
+        worst = order[~self.cameras[order].isnan()][:3].tolist()  # NaN: without pairs
         one, other = (*what.cameras, None, None)[:2]
         template = _SENTENCES.get(what.cause, _MENDED)
         return (_MOVING if moves else template).format(

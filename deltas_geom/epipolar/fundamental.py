@@ -16,14 +16,14 @@ from deltas_geom.numerics.arithmetic import (
     unless_all,
     without_autocast,
 )
+from deltas_geom.numerics.vectors import matrix3
 
 
 def cross_matrix(vectors: Tensor) -> Tensor:
     """[v]x with [v]x u = v x u: ``(*B, 3)`` to ``(*B, 3, 3)``."""
     x, y, z = vectors.unbind(dim=-1)
     zero = torch.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return torch.stack(rows, dim=-1).reshape(*vectors.shape[:-1], 3, 3)
+    return matrix3(zero, -z, y, z, zero, -x, -y, x, zero)
 
 
 def inverse_intrinsics(K: Tensor) -> Tensor:
@@ -31,12 +31,11 @@ def inverse_intrinsics(K: Tensor) -> Tensor:
     fx, fy, skew = K[..., 0, 0], K[..., 1, 1], K[..., 0, 1]
     cx, cy = K[..., 0, 2], K[..., 1, 2]
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    rows = [
+    return matrix3(
         1 / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy),
         zero, 1 / fy, -cy / fy,
         zero, zero, one,
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(K.shape)
+    )  # fmt: skip
 
 
 @at_least_in_single

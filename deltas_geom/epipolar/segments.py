@@ -96,14 +96,9 @@ class Segments(Record):
 
 
 def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
-    """How the anchor's pixels move through the sources with inverse depth.
+    """How the anchor's pixels ``(*B, N, 2)`` move through the sources with inverse depth.
 
-    Args:
-        views: the anchor (view 0) and its V-1 sources.
-        pixels: ``(*B, N, 2)`` keypoints of the anchor.
-
-    Raises:
-        ShapeError: a trailing shape differs, batch dims do not broadcast, or there is no view.
+    Raises as :func:`epipolar_segments`.
     """
     cameras, posed, batch = finite_views(views)
     check_shapes(K=(cameras[0], "+V 3 3"), pixels=(pixels, "N 2"))
@@ -135,14 +130,7 @@ def epipolar_rays(views: PosedViews, pixels: Tensor) -> EpipolarRays:
         slope_terms = to_source @ from_anchor @ poses[..., :1, :3, 3:]
         slope_terms = slope_terms + K_source.abs() @ poses[..., 1:, :3, 3:]
     return EpipolarRays(
-        origin,
-        slope,
-        usable,
-        finite,
-        clearance,
-        clearance_slope,
-        terms,
-        slope_terms.mT,
+        origin, slope, usable, finite, clearance, clearance_slope, terms, slope_terms.mT
     )
 
 
@@ -193,27 +181,21 @@ def epipolar_segments(
     height, width = image_size
     origin, slope = rays.origin, rays.slope.expand_as(rays.origin)
 
-    def margins(homogeneous: Tensor) -> Tensor:
+    def margins(homogeneous: Tensor, clearance: Tensor) -> Tensor:
         """``(..., 5)`` from what a pixel must not leave: in front, left, right, top, bottom."""
         x, y, z = homogeneous.unbind(dim=-1)
         # Not by a matrix, whose numbers would be copied to the device and waited for.
         left, right = x + 0.5 * z, (width - 0.5) * z - x
         top, bottom = y + 0.5 * z, (height - 0.5) * z - y
-        return torch.stack([z, left, right, top, bottom], dim=-1)
+        # In front by more than rounding, so that the division by depth below is safe.
+        return torch.stack([z - clearance, left, right, top, bottom], dim=-1)
 
     # Each asks constant + w growth >= 0 of the inverse depth w.
-    constant, growth = margins(origin), margins(slope)
-    # In front by more than rounding, so that the division by depth below is safe.
-    depth, other = constant[..., :1] - rays.clearance[..., None], constant[..., 1:]
-    constant = torch.cat([depth, other], dim=-1)
-    depth, other = growth[..., :1] - rays.clearance_slope[..., None], growth[..., 1:]
-    growth = torch.cat([depth, other], dim=-1)
-
+    constant, growth = margins(origin, rays.clearance), margins(slope, rays.clearance_slope)
     moving = growth != 0
     crossing = safe_divide(-constant, growth, moving)
-    infinity = float("inf")
-    low = torch.where(moving & (growth > 0), crossing, -infinity).amax(dim=-1)
-    high = torch.where(moving & (growth < 0), crossing, infinity).amin(dim=-1)
+    low = torch.where(moving & (growth > 0), crossing, -torch.inf).amax(dim=-1)
+    high = torch.where(moving & (growth < 0), crossing, torch.inf).amin(dim=-1)
     low, high = low.clamp(min=1 / far), high.clamp(max=1 / near)
     always_out = (~moving & (constant < 0)).any(dim=-1)
     visible = only((low <= high) & ~always_out, rays.usable, other=False)

@@ -69,10 +69,7 @@ def correlate(
     check_bool(mask=samples.mask)
     pixels, mask = samples.pixels, samples.mask
     batch = batch_shape(
-        (*descriptors.shape[:-2], 1),
-        feature_map.shape[:-3],
-        pixels.shape[:-4],
-        mask.shape[:-3],
+        (*descriptors.shape[:-2], 1), feature_map.shape[:-3], pixels.shape[:-4], mask.shape[:-3]
     )
     maps, rows = feature_map, descriptors
     finite = surely_below(maps) and surely_below(rows)

@@ -62,25 +62,19 @@ def recomputed(
     compiling = torch.compiler.is_compiling()
     if not differentiated(*tensors):
         with outside_gradients():
-            return _values(values, cut, *tensors)
+            return in_chunks(values, cut, *tensors)
     kind = _Traced if compiling else _Recomputed
     outputs: tuple[Tensor, ...] = kind.apply(function, values, cut, adjoint, *tensors)  # type: ignore[no-untyped-call]
     return outputs
 
 
 def in_chunks(function: Function, cut: Cut | None, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """``function(*tensors)``, some points at a time."""
+    """``function(*tensors)``, some points at a time, without a derivative."""
     if cut is None:
         return function(*tensors)
+    cut = cut if cut.values is None else cut._replace(size=cut.values)
     parts = [function(*some) for some in chunks(cut, tensors, cut.inputs)]
     return tuple(map(joined, zip(*parts, strict=True), cut.outputs))
-
-
-def _values(function: Function, cut: Cut | None, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """The same without a derivative."""
-    if cut is not None and cut.values is not None:
-        cut = cut._replace(size=cut.values)
-    return in_chunks(function, cut, *tensors)
 
 
 def differentiated(*tensors: Tensor | None) -> bool:
@@ -123,7 +117,7 @@ class _Keeping(torch.autograd.Function):
             ctx.set_materialize_grads(False)
         ctx.function, ctx.cut, ctx.adjoint = function, cut, adjoint
         ctx.save_for_backward(*tensors)
-        outputs = _values(values, cut, *tensors)
+        outputs = in_chunks(values, cut, *tensors)
         ctx.floating = [out.is_floating_point() for out in outputs]
         ctx.mark_non_differentiable(
             *(out for k, out in enumerate(outputs) if (adjoint and k) or not ctx.floating[k])

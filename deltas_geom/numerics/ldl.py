@@ -12,13 +12,13 @@ from deltas_geom.numerics.symmetric3 import substituted3
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, less, scaled
 
 
-def rounding(matrix: Symmetric4) -> Tensor:
-    """What rounding of the entries may do to an eigenvalue; without gradient."""
-    return rounding_of((matrix[0] + matrix[4] + matrix[7] + matrix[9]).detach())
+def trace_of(matrix: Symmetric4) -> Tensor:
+    """The sum of the diagonal."""
+    return matrix[0] + matrix[4] + matrix[7] + matrix[9]
 
 
-def rounding_of(trace: Tensor) -> Tensor:
-    """The same from the trace."""
+def rounding(trace: Tensor) -> Tensor:
+    """What rounding of a matrix's entries may do to an eigenvalue, from its trace."""
     return (64 * torch.finfo(trace.dtype).eps) * trace
 
 

@@ -24,11 +24,11 @@ from deltas_geom.numerics.ldl import (
     factor,
     multiply,
     rounding,
-    rounding_of,
     shifted,
     solve_leading,
     solve_scaled,
     start,
+    trace_of,
 )
 from deltas_geom.numerics.symmetric3 import solve3
 from deltas_geom.numerics.vectors import (
@@ -112,10 +112,10 @@ def proved_vector(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]
     y = plus(p, t, q)
     x = plus(p, f.d3 / (1 + dot(p, y)), solve_leading(f, y))
 
-    trace = matrix[0] + matrix[4] + matrix[7] + matrix[9]
+    trace = trace_of(matrix)
     inverse = (0.5 * trace).square() * f.i0 * f.i1 * f.i2  # 1 / s
     # A tenth, and of an eigenvalue that holds the noise, is more than rounding can feign.
-    share = (t.abs() + rounding_of(trace)) * inverse
+    share = (t.abs() + rounding(trace)) * inverse
     apart = (share > 0) & (share <= 0.1)
     ratio = share / size
     # |y| >= |x|, since p^T A^-1 p is positive; the residual is t^2 times q across x.
@@ -127,12 +127,9 @@ def proved_vector(matrix: Symmetric4, accuracy: float) -> tuple[Vector4, Tensor]
 
 
 def _iterated(
-    matrix: Symmetric4,
-    *,
-    product: Callable[[Vector4], Vector4] | None = None,
-    polish: int = 0,
+    matrix: Symmetric4, *, product: Callable[[Vector4], Vector4] | None = None, polish: int = 0
 ) -> NullVector:
-    noise = rounding(matrix)
+    noise = rounding(trace_of(matrix))
     # Above the null space by the rounding of M, every pivot is positive.
     factors = factor(shifted(matrix, -noise))
     x = start(factors)

@@ -5,12 +5,17 @@ never raises and compiles. Components broadcast.
 """
 
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import values_at_hand
 
+Array = NDArray[Any]
+Numbers = TypeVar("Numbers", Tensor, Array)
+"""What is written once for torch and NumPy."""
 Vector3 = tuple[Tensor, ...]
 """x y z."""
 Vector4 = tuple[Tensor, ...]
@@ -57,6 +62,11 @@ def less(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 def either(where: Tensor, a: Sequence[Tensor], b: Sequence[Tensor | float]) -> tuple[Tensor, ...]:
     """a where that holds, elsewhere b."""
     return tuple([torch.where(where, p, q) for p, q in zip(a, b, strict=True)])
+
+
+def matrix3(*entries: Tensor) -> Tensor:
+    """``(*B, 3, 3)`` from nine ``(*B)``, row by row."""
+    return torch.stack(entries, dim=-1).reshape(*entries[0].shape, 3, 3)
 
 
 def as_one(parts: Sequence[Tensor], dtype: torch.dtype) -> Tensor:

@@ -15,8 +15,7 @@ from torch import Tensor
 from deltas_geom.numerics.ldl import multiply
 from deltas_geom.numerics.null_vector import solve_in_complement
 from deltas_geom.numerics.sums import over_points, product
-from deltas_geom.numerics.vectors import Vector3, Vector4, as_one, dot, either, scaled
-from deltas_geom.triangulation.dlt import Numbers
+from deltas_geom.numerics.vectors import Numbers, Vector3, Vector4, as_one, dot, either, scaled
 from deltas_geom.triangulation.equations import Equations, out_of_frame
 from deltas_geom.triangulation.observed import Observations, homogeneous_in_views
 from deltas_geom.triangulation.solution import of_length_one, of_trace_one

@@ -23,11 +23,7 @@ from deltas_geom.numerics.arithmetic import (
 from deltas_geom.numerics.chunks import Cut
 from deltas_geom.numerics.evaluation import in_chunks
 from deltas_geom.numerics.vectors import dot
-from deltas_geom.triangulation.bearings import (
-    Bearings,
-    angles_of,
-    see_rays,
-)
+from deltas_geom.triangulation.bearings import Bearings, angles_of, see_rays
 from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.rays import triangulate_rays
 from deltas_geom.triangulation.refine import Refined, refine_points

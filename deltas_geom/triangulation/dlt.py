@@ -17,16 +17,12 @@ Many points are solved so, few by the rows.
 Source: Hartley and Zisserman, 2nd ed., section 12.2, without weights.
 """
 
-from typing import Any, TypeVar
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom.numerics.sums import over_views, plain, product
-
-Numbers = TypeVar("Numbers", Tensor, NDArray[Any])
+from deltas_geom.numerics.vectors import Numbers
 
 
 def rows(proj: Numbers, pixels: Numbers) -> Numbers:

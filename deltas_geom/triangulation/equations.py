@@ -11,12 +11,7 @@ from deltas_geom.numerics.arithmetic import only, unless_all
 from deltas_geom.numerics.sums import over_views, plain, product
 from deltas_geom.numerics.vectors import Symmetric4, Vector3, Vector4, dot, plus
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
-from deltas_geom.triangulation.observed import (
-    Cameras,
-    Observations,
-    homogeneous_in_views,
-    in_views,
-)
+from deltas_geom.triangulation.observed import Cameras, Observations, homogeneous_in_views, in_views
 from deltas_geom.triangulation.rig_frame import (
     Moments,
     RigFrame,
@@ -29,12 +24,11 @@ from deltas_geom.triangulation.rig_frame import (
 from deltas_geom.triangulation.weights import weigh
 
 Frame = Literal["rig", "world"]
-FRAMES = ("rig", "world")
 
 
 def check_settings(frame: Frame, max_residual: float | None = None) -> None:
     """Raise ``ValueError`` where a setting makes no sense."""
-    if frame not in FRAMES:
+    if frame not in ("rig", "world"):
         raise ValueError(f"frame must be 'rig' or 'world', got {frame!r}")
     if max_residual is not None:
         check_positive(max_residual=max_residual)
@@ -150,15 +144,7 @@ def equations_of(
     dtype: torch.dtype,
     alike: Alike | None = None,
 ) -> Equations:
-    """The equations of what cameras see.
-
-    Args:
-        rig: of the cameras.
-        observed: pixels and weights.
-        frame: "rig" or "world".
-        dtype: of the inputs.
-        alike: of points without weights and mask.
-    """
+    """The equations of what cameras see; ``dtype`` of the inputs, ``alike`` where points are."""
     x, y, weights = observed
     if alike is None:
         framed = _framed(rig, rig_sums(rig.moments, weights), frame, dtype)

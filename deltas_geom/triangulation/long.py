@@ -16,12 +16,7 @@ from deltas_geom.triangulation.adjoint import gradients_of
 from deltas_geom.triangulation.equations import Equations, Frame, Rig, alike_of, equations_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.observed import observe
-from deltas_geom.triangulation.reprojection import (
-    mean_of,
-    parallax_of,
-    reproject,
-    squared_errors,
-)
+from deltas_geom.triangulation.reprojection import mean_of, parallax_of, reproject, squared_errors
 from deltas_geom.triangulation.solution import follow_linear, in_world, kept, solve_linear
 from deltas_geom.triangulation.uncertainty import covariance_of, representable, unscaled
 
@@ -54,26 +49,7 @@ class LongWay:
 
     def full(self, *seen: Any, covariance: bool, derivable: bool = False) -> tuple[Tensor, ...]:
         """The fields of a :class:`Triangulation`, status last."""
-        return self._described(*self.placed(*seen, derivable=derivable), covariance)
-
-    def placed(self, *seen: Any, derivable: bool) -> tuple[Equations, Vector3, Tensor]:
-        """The equations, points in the world, 0 where they fail, and their status."""
-        equations = self.see(*seen)
-        found, status = solve_linear(equations)
-        valid = ok(status)
-        if derivable:
-            found = follow_linear(equations, found, valid)
-        return equations, kept(in_world(found.points, self.rig.datum), valid), status
-
-    def see(self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None) -> Equations:
-        """The equations of what is seen."""
-        seen = observe(pixels, weights, mask, self.batch)
-        return equations_of(self.rig, seen, frame=self.frame, dtype=self.dtype, alike=self.alike)
-
-    def _described(
-        self, equations: Equations, points: Vector3, status: Tensor, covariance: bool
-    ) -> tuple[Tensor, ...]:
-        """The fields of a :class:`Triangulation`, status last."""
+        equations, points, status = self.placed(*seen, derivable=derivable)
         cameras, valid = equations.rig.cameras, ok(status).unsqueeze(-2)
         px, py, weights = equations.observed
         used = ~weights.unused & valid
@@ -95,6 +71,20 @@ class LongWay:
             )
             described = (*described, representable(noise, self.dtype))
         return (*described, status)
+
+    def placed(self, *seen: Any, derivable: bool) -> tuple[Equations, Vector3, Tensor]:
+        """The equations, points in the world, 0 where they fail, and their status."""
+        equations = self.see(*seen)
+        found, status = solve_linear(equations)
+        valid = ok(status)
+        if derivable:
+            found = follow_linear(equations, found, valid)
+        return equations, kept(in_world(found.points, self.rig.datum), valid), status
+
+    def see(self, pixels: Tensor, weights: Tensor | None, mask: Tensor | None) -> Equations:
+        """The equations of what is seen."""
+        seen = observe(pixels, weights, mask, self.batch)
+        return equations_of(self.rig, seen, frame=self.frame, dtype=self.dtype, alike=self.alike)
 
     def adjoint(
         self,

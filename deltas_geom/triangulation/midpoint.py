@@ -29,6 +29,7 @@ from deltas_geom.triangulation.judge import judge, ok
 from deltas_geom.triangulation.observed import check_observed
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.results import Triangulation
+from deltas_geom.triangulation.rig_frame import camera_moments
 
 
 @without_autocast
@@ -192,14 +193,11 @@ def _nearest(directions: Vector3, weight: Tensor, target: Vector3) -> tuple[Vect
 def _judge(seen: Bearings, points: Vector3, share: Tensor) -> Tensor:
     """Status ``(*B, N)`` int8 of the midpoints."""
     eps, least = torch.finfo(seen.dtype).eps, 64 * torch.finfo(share.dtype).eps
-    centers = seen.centers - seen.datum
-    square = centers.square().sum(dim=-1, keepdim=True)
-    from_world = seen.centers.square().sum(dim=-1, keepdim=True)
-    moments = torch.cat([torch.ones_like(square), square, from_world, centers], dim=-1).mT
+    _, moments = camera_moments(seen.centers, seen.datum, seen.broken)
     counted = seen.weights.used
     count, *sums = over_views(moments, counted)
     total = count.clamp(min=1)
-    square, size, *middle = (part / total for part in sums)
+    square, *middle, size, _ = (part / total for part in sums)
     # Of the cameras, squared, all alike: their spread, and the part of it across the rays.
     reach = square - dot(tuple(middle), tuple(middle))
     along = dot(seen.directions, seen.offsets(tuple(middle))) * counted

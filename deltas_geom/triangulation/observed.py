@@ -21,8 +21,7 @@ from deltas_geom.numerics.arithmetic import (
 )
 from deltas_geom.numerics.sums import plain, product
 from deltas_geom.numerics.vectors import Vector3
-from deltas_geom.triangulation.weighed import weigh_at_hand
-from deltas_geom.triangulation.weights import Weights, weigh
+from deltas_geom.triangulation.weights import Weights, weigh, weigh_at_hand
 
 _DIMS = {
     "proj": "+V 3 4",
@@ -91,14 +90,7 @@ class Observations(NamedTuple):
 def observe(
     pixels: Tensor, weights: Tensor | None, mask: Tensor | None, batch: torch.Size
 ) -> Observations:
-    """Broadcast, and tell used from unused.
-
-    Args:
-        pixels: ``(*B, V, N, 2)``; those of unused views may hold anything.
-        weights: see :func:`deltas_geom.triangulation.weights.weigh`.
-        mask: see there.
-        batch: of the cameras, pixels, weights and mask together.
-    """
+    """Pixels ``(*B, V, N, 2)`` broadcast to a batch, with weights and mask as of :func:`weigh`."""
     if pixels.numel() and batch.numel() and plain(pixels, weights, mask):
         return _observe_at_hand(pixels, weights, mask, batch)
     x, y, sound = clean_pixels(pixels)

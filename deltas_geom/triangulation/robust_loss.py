@@ -45,8 +45,6 @@ def second_derivative(
         inverse: ``(*B, V, N)`` 1 / depth.
         influence: ``(*B, V, N)`` w^2 rho'.
         bend: ``(*B, V, N)`` 2 w^2 rho''.
-
-    Source: Triggs et al., Bundle Adjustment: A Modern Synthesis (2000), section 4.3.
     """
     (x, y), (dx, dy) = place, offset
     p1, p2, p3 = proj[..., :3].unsqueeze(-2).unbind(dim=-3)  # (*B, V, 1, 3)

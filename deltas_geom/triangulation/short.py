@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from deltas_geom.numerics.vectors import Array
 from deltas_geom.triangulation.dlt import rows
 from deltas_geom.triangulation.judge import REASONS
 from deltas_geom.triangulation.observed import Cameras
-from deltas_geom.triangulation.weighed import Weighed, weigh_at_hand
+from deltas_geom.triangulation.weights import Weighed, weigh_at_hand
 
-Array = NDArray[Any]
 FEW = 256
 """Points up to which this is the shorter way."""
 _POLISH = 2
@@ -47,8 +46,7 @@ class ShortRig(NamedTuple):
 
     def cameras(self) -> Cameras:
         """For the long way."""
-        known = map(torch.from_numpy, (self.proj, self.inverse, self.centers))
-        proj, inverse, centers = known
+        proj, inverse, centers = map(torch.from_numpy, (self.proj, self.inverse, self.centers))
         return Cameras(proj, torch.from_numpy(~self.finite).double(), inverse, centers)
 
 
@@ -121,15 +119,9 @@ def solve(
     fixed: bool,
     dtype: np.dtype[Any],
 ) -> Solved:
-    """Points of pixels ``(*B, V, N, 2)``, weights and mask ``(*B, V, N)``.
+    """Points of pixels ``(*B, V, N, 2)``, with weights and mask as of :func:`weigh`.
 
-    Args:
-        rig: of the cameras.
-        pixels: those of unused views may hold anything.
-        weights: 0 = unused; the sign has no effect. NaN counts as used.
-        mask: True = used.
-        fixed: solve in the world's frame.
-        dtype: of the inputs.
+    ``fixed``: in the world's frame; ``dtype``: of the inputs.
     """
     with np.errstate(all="ignore"):
         seen, share, largest, used, sound = _observed(pixels, weights, mask)

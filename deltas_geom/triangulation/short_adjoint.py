@@ -2,24 +2,17 @@
 
 import numpy as np
 
+from deltas_geom.numerics.vectors import Array
 from deltas_geom.triangulation.adjoint import through_centers, through_frame
-from deltas_geom.triangulation.short import Array, ShortRig, Solved
+from deltas_geom.triangulation.short import ShortRig, Solved
 
 
 def gradients(
     rig: ShortRig, solved: Solved, gradient: Array, *, fixed: bool, of_cameras: bool
 ) -> tuple[Array | None, Array, Array]:
-    """Of the sum of gradient * points, by cameras, pixels and the size of weights.
+    """As :func:`gradients_of`, but by the size of weights, with a gradient ``(*B, N, 3)``.
 
-    Args:
-        rig: of the cameras.
-        solved: the points.
-        gradient: ``(*B, N, 3)``.
-        fixed: were they solved in the world's frame?
-        of_cameras: else the first result is None.
-
-    Returns:
-        ``(*B, V, 3, 4)``, ``(*B, V, N, 2)`` and ``(*B, V, N)``, broadcast as the inputs were.
+    ``fixed``: were the points solved in the world's frame?
     """
     with np.errstate(all="ignore"):
         valid = solved.status == 0

@@ -4,9 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from deltas_geom.numerics.vectors import Array
 from deltas_geom.triangulation.equations import Frame
 from deltas_geom.triangulation.reprojection import reproject
-from deltas_geom.triangulation.short import Array, ShortRig, Solved, describe, solve
+from deltas_geom.triangulation.short import ShortRig, Solved, describe, solve
 from deltas_geom.triangulation.short_adjoint import gradients
 from deltas_geom.triangulation.uncertainty import covariance_of, representable, unscaled
 

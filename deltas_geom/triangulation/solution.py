@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import surely_all, without_gradients
-from deltas_geom.numerics.ldl import multiply
+from deltas_geom.numerics.ldl import multiply, trace_of
 from deltas_geom.numerics.null_vector import null_vector, rayleigh_step
 from deltas_geom.numerics.vectors import (
     Symmetric4,
@@ -107,7 +107,7 @@ def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]
     """
     # Double where: what has failed must pass no gradient and no NaN.
     easy = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
-    trace = torch.where(valid, normal[0] + normal[4] + normal[7] + normal[9], 1.0).detach()
+    trace = torch.where(valid, trace_of(normal), 1.0).detach()
     # Of trace 1, so that powers of its entries in the gradient neither overflow nor vanish.
     share = trace.reciprocal()
     return scaled(either(valid, normal, easy), share), share

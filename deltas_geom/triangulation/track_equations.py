@@ -65,16 +65,7 @@ def pose_tracks(
     *,
     num_points: int,
 ) -> PosedTracks:
-    """The equations of what :func:`triangulate_tracks` is given, its arguments checked.
-
-    Args:
-        proj: ``(C, 3, 4)``.
-        pixels: ``(T, 2)``.
-        camera_index: ``(T)`` int64.
-        point_index: ``(T)`` int64.
-        weights: ``(T)``.
-        num_points: N.
-    """
+    """The equations of what :func:`triangulate_tracks` is given, checked, with indices int64."""
     cameras, broken, _, centers = cameras_of(proj)
     camera = at(cameras.permute(1, 2, 0), camera_index)
     x, y, sound = clean_pixels(pixels)
@@ -86,9 +77,7 @@ def pose_tracks(
     sums = (
         summed(at(moments, camera_index) * times, point_index, num_points).unbind()
         for moments, times in zip(
-            camera_moments(centers, datum, broken),
-            (weighed.squared, weighed.used),
-            strict=True,
+            camera_moments(centers, datum, broken), (weighed.squared, weighed.used), strict=True
         )
     )
     frame = rig_frame(*sums, eps=torch.finfo(proj.dtype).eps)

@@ -16,13 +16,7 @@ from deltas_geom.status import Status
 from deltas_geom.triangulation.operation import operation
 from deltas_geom.triangulation.reprojection import angle_of, projected, squared_errors
 from deltas_geom.triangulation.results import beyond, within_residual, without
-from deltas_geom.triangulation.solution import (
-    Solution,
-    follow_linear,
-    in_world,
-    kept,
-    solve_linear,
-)
+from deltas_geom.triangulation.solution import Solution, follow_linear, in_world, kept, solve_linear
 from deltas_geom.triangulation.track_equations import (
     PosedTracks,
     at,

@@ -1,5 +1,6 @@
 """Weighted, masked n-view DLT triangulation; every point carries a Status."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 from deltas_geom.numerics.arithmetic import outside_gradients, values_at_hand, without_autocast
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import Adjoint, Function, recomputed, transformed
-from deltas_geom.triangulation.equations import FRAMES, Frame, Rig, check_settings, rig_of
+from deltas_geom.triangulation.equations import Frame, Rig, check_settings, rig_of
 from deltas_geom.triangulation.judge import ok
 from deltas_geom.triangulation.long import LongWay
 from deltas_geom.triangulation.observed import Cameras, cameras_of, check_observed
@@ -84,9 +85,6 @@ def triangulate(
     return found if max_residual is None else found.within_residual(max_residual)
 
 
-_PLAIN = (torch.float32, torch.float64, torch.bool)  # NumPy has no bfloat16
-
-
 class KnownCameras:
     """Cameras, and what depends on them alone: computed when it is first needed, and then kept.
 
@@ -101,10 +99,7 @@ class KnownCameras:
 
     def cameras(self) -> Cameras:
         """In the solver's type, without gradient."""
-        return self.short().cameras() if self._plain() else cameras_of(self.proj.detach())
-
-    def _plain(self) -> bool:
-        return values_at_hand(self.proj) and self.proj.dtype in _PLAIN
+        return self.short().cameras() if _at_hand(self.proj) else cameras_of(self.proj.detach())
 
     def short(self) -> ShortRig:
         """For few points."""
@@ -120,15 +115,7 @@ class KnownCameras:
 
 
 class Call:
-    """One triangulation: how it is computed, and how it is derived.
-
-    Args:
-        known: the cameras.
-        pixels: ``(*B, V, N, 2)``.
-        weights: ``(*B, V, N)`` or None.
-        mask: ``(*B, V, N)`` or None.
-        frame: in which points are solved.
-    """
+    """One triangulation, with arguments of :func:`triangulate`: how it is computed and derived."""
 
     def __init__(
         self,
@@ -138,17 +125,13 @@ class Call:
         mask: Tensor | None,
         frame: Frame,
     ) -> None:
-        if frame not in FRAMES:
-            check_settings(frame)
+        check_settings(frame)
         proj = known.proj
         self.batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask)
         self.tensors: tuple[Any, ...] = (proj, pixels, weights, mask)
         self.known, self.frame, self.dtype = known, frame, proj.dtype
         self.alike = weights is None and mask is None
-        # What a compiler, a transform or another device holds has no values to look at.
-        self.at_hand = all(
-            t is None or (values_at_hand(t) and t.dtype in _PLAIN) for t in self.tensors
-        )
+        self.at_hand = all(map(_at_hand, self.tensors))
         count = self.batch.numel() * pixels.shape[-2]
         # The normal matrix of the world's frame loses digits that an SVD of the rows keeps.
         exactly = frame == "world" and proj.dtype == torch.float64
@@ -184,10 +167,7 @@ class Call:
             found = self.way.adjoint(gradients[0], needed, *tensors[1:])
             return (*map(_shaped_as, found, tensors), None)
 
-        def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
-            return self.way.points(*seen)
-
-        return self._computed(derivable, values, (-2,), adjoint)[0]
+        return self._computed(derivable, self.way.points, (-2,), adjoint)[0]
 
     def full(self, *, covariance: bool) -> Triangulation:
         """Points with all that is known about them."""
@@ -197,9 +177,7 @@ class Call:
                 *seen, covariance=covariance, derivable=True
             )
 
-        def values(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
-            return self.way.full(*seen, covariance=covariance)
-
+        values = partial(self.way.full, covariance=covariance)
         dims = (-2, -1, -1, -1, -1, *([-3] if covariance else []), -1)
         found = self._computed(derivable, values, dims)
         points, depth, residual, parallax, errors, *noise, status = found
@@ -215,7 +193,17 @@ class Call:
     ) -> tuple[Tensor, ...]:
         serial = self.at_hand and adjoint is not None and self.dtype == torch.float32
         cut = cut_points(self.tensors[1], -2, -1, -1, outputs=outputs, serial=serial)
-        return recomputed(function, *self.tensors, values=values, cut=cut, adjoint=adjoint)
+
+        def of_seen(_: Tensor, *seen: Any) -> tuple[Tensor, ...]:
+            return values(*seen)
+
+        return recomputed(function, *self.tensors, values=of_seen, cut=cut, adjoint=adjoint)
+
+
+def _at_hand(tensor: Tensor | None) -> bool:
+    """Are there values to look at, and does NumPy know their type, as it does not bfloat16?"""
+    known = (torch.float32, torch.float64, torch.bool)
+    return tensor is None or (values_at_hand(tensor) and tensor.dtype in known)
 
 
 def _shaped_as(gradient: Tensor | None, tensor: Tensor | None) -> Tensor | None:

@@ -13,7 +13,7 @@ from deltas_geom.numerics.arithmetic import (
     without_autocast,
 )
 from deltas_geom.numerics.symmetric3 import inverse3
-from deltas_geom.numerics.vectors import Symmetric3, Vector3
+from deltas_geom.numerics.vectors import Symmetric3, Vector3, matrix3
 from deltas_geom.triangulation.dlt import normal_coefficients, normal_matrix
 from deltas_geom.triangulation.observed import (
     cameras_of,
@@ -222,10 +222,14 @@ def covariance_of(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetr
 
     The largest number times the identity where the sum is not within the range of numbers.
     """
+    return inverse_information(_information(proj, found, squared), found.seen.sum(dim=-2) >= 2)
+
+
+def _information(proj: Tensor, found: Reprojection, squared: Tensor) -> Symmetric3:
+    """sum w^2 J^T J of each point, six ``(*B, N)``."""
     by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
     # The derivative of a pixel by the point is its equations, divided by the depth.
-    information = normal_matrix(normal_coefficients(proj[..., :3]), found.x, found.y, by_depth)
-    return inverse_information(information, found.seen.sum(dim=-2) >= 2)
+    return normal_matrix(normal_coefficients(proj[..., :3]), found.x, found.y, by_depth)
 
 
 def inverse_information(normal: Sequence[Tensor], enough: Tensor) -> Symmetric3:
@@ -247,7 +251,7 @@ def unpacked3(entries: Sequence[Tensor]) -> Tensor:
     """Symmetric matrices ``(*B, N, 3, 3)`` from six ``(*B, N)``."""
     xx, xy, xz, yy, yz, zz = entries
     # Not an index: it would be copied to the device.
-    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(*xx.shape, 3, 3)
+    return matrix3(xx, xy, xz, xy, yy, yz, xz, yz, zz)
 
 
 def unscaled(entries: Sequence[Tensor], largest: Tensor) -> Tensor:
@@ -270,11 +274,9 @@ def _of_poses(
     A camera that is displaced by d and turned by r about its centre c sees a point X where it
     would have seen X - d + (X - c) x r.
     """
-    by_depth = torch.where(found.seen, squared, 0.0) * found.inverse * found.inverse
-    view = cameras.unsqueeze(-3)  # each view alone, to keep their information apart
-    x, y, w = (tensor.unsqueeze(-2) for tensor in (found.x, found.y, by_depth))
-    normal = normal_matrix(normal_coefficients(view[..., :3]), x, y, w)
-    information = unpacked3(normal)  # (*B, V, N, 3, 3)
+    # Each view alone, to keep their information apart: (*B, V, N, 3, 3).
+    views = Reprojection(*(of_all.unsqueeze(-2) for of_all in found))
+    information = unpacked3(_information(cameras.unsqueeze(-3), views, squared.unsqueeze(-2)))
     ox, oy, oz = (
         component.unsqueeze(-2) - center.unsqueeze(-1)
         for component, center in zip(

@@ -1,15 +1,23 @@
-"""How much each view counts for each point, and which count at all."""
+"""How much each view counts for each point, and which count at all.
 
+Of tensors, by what torch derives and traces; of values at hand in NumPy, which starts no threads.
+"""
+
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import only, solver_dtype, values_at_hand
+from deltas_geom.numerics.vectors import Array, Numbers
 
 NEGLIGIBLE_WEIGHT = 1e-6
 """A view whose weight is below this share of the point's largest counts as no view: its squared
 weight, times a small parallax, would be lost in the rounding of the normal matrix."""
+_FARTHEST = float(np.finfo(np.float64).max) ** 0.125  # px: squares of what is beyond overflow
 
 
 class Weights(NamedTuple):
@@ -68,47 +76,16 @@ def weigh(
         )
     # What is not sound makes its point fail, if it is used: it need not be told from point to
     # point where all are alike.
-    squared, largest, unused, counted = _shares(weight, largest, None if alike else sound)
+    able = None if alike else sound
+    share, largest, unused, counted = _shares(only(weight, able), size, largest, torch.where)
     known = counted if sound is None else (sound | unused) & counted
-    return Weights(squared, largest, unused, (~unused).to(work), known.all(dim=-2))
+    return Weights(share * share, largest, unused, (~unused).to(work), known.all(dim=-2))
 
 
 def _all_one(one: Tensor) -> Weights:
     """Of views ``(*B, V, 1)`` that all count, and as much."""
     none = torch.zeros_like(one, dtype=torch.bool)
     return Weights(one, one[..., :1, :], none, one, ~none[..., 0, :])
-
-
-def weigh_listed(weights: Tensor, point: Tensor, count: int, *, sound: Tensor) -> Weights:
-    """The same of a list of observations, all fields ``(T)`` but ``sound`` and ``largest`` ``(N)``.
-
-    Args:
-        weights: ``(T)``, in the solver's type.
-        point: ``(T)`` index of each observation's point.
-        count: N.
-        sound: ``(T)`` bool.
-    """
-    size = weights.detach().abs()
-    sound = sound & (size <= torch.finfo(size.dtype).max)  # NaN is not
-    largest = size.new_zeros(count).scatter_reduce(0, point, size.nan_to_num(0.0), "amax")
-    squared, _, unused, _ = _shares(weights, largest.index_select(0, point), sound)
-    wrong = size.new_zeros(count).index_add(0, point, (~(sound | unused)).to(size.dtype))
-    largest = torch.where(largest > 0, largest, 1.0)
-    return Weights(squared, largest, unused, (~unused).to(size.dtype), wrong == 0)
-
-
-def _shares(
-    weight: Tensor, largest: Tensor, sound: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Squared shares of the largest, 0 unless used and sound; the largest, or 1 if that is no
-    number to divide by; what is unused; is the largest finite?
-    """
-    unused = weight.detach().abs() <= NEGLIGIBLE_WEIGHT * largest
-    counted = largest <= torch.finfo(largest.dtype).max  # NaN is not, either
-    largest = torch.where(counted & (largest > 0), largest, 1.0)
-    # Double where: an infinite weight must not turn the gradient into NaN.
-    share = only(weight, counted, sound) / largest
-    return only(share * share, ~unused, sound), largest, unused, counted
 
 
 def _all_count(size: Tensor, largest: Tensor) -> bool:
@@ -118,3 +95,93 @@ def _all_count(size: Tensor, largest: Tensor) -> bool:
         and size.numel() > 0
         and bool((size / largest).amin() > NEGLIGIBLE_WEIGHT)  # inf / inf is not
     )
+
+
+def _shares(
+    weight: Numbers, size: Numbers, largest: Numbers, where: Callable[..., Numbers]
+) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+    """Shares of the largest weight, 0 unless used and finite; the largest, or 1 if that is no
+    number to divide by; what is unused; is the largest finite? Of tensors or arrays.
+    """
+    unused = size <= NEGLIGIBLE_WEIGHT * largest
+    counted = largest < math.inf  # NaN is not, either
+    largest = where(counted & (largest > 0), largest, 1.0)
+    # Double where: an infinite weight must not turn the gradient into NaN.
+    return where(counted & ~unused, weight, 0.0) / largest, largest, unused, counted
+
+
+def weigh_listed(weights: Tensor, point: Tensor, count: int, *, sound: Tensor) -> Weights:
+    """The same of a list of observations ``(T)`` of N points, whose index is ``point``.
+
+    All fields are ``(T)`` but ``sound`` and ``largest`` ``(N)``.
+    """
+    size = weights.detach().abs()
+    sound = sound & (size < math.inf)  # NaN is not
+    largest = size.new_zeros(count).scatter_reduce(0, point, size.nan_to_num(0.0), "amax")
+    of_each = largest.index_select(0, point)
+    share, _, unused, _ = _shares(only(weights, sound), size, of_each, torch.where)
+    wrong = size.new_zeros(count).index_add(0, point, (~(sound | unused)).to(size.dtype))
+    largest = torch.where(largest > 0, largest, 1.0)
+    return Weights(share * share, largest, unused, (~unused).to(size.dtype), wrong == 0)
+
+
+class Weighed(NamedTuple):
+    """Pixels, and how much each view counts for each point, at hand.
+
+    Arrays may have 1 in place of N where all points are alike.
+
+    Attributes:
+        pixels: float64, 0 where not finite.
+        share: weights by each point's largest, 0 where unused or not finite.
+        largest: that; 1 if it is 0.
+        used: bool.
+        sound: bool, without the views' axis: every used pixel and weight is finite.
+    """
+
+    pixels: Array
+    share: Array
+    largest: Array
+    used: Array
+    sound: Array
+
+
+def weigh_at_hand(
+    pixels: Array,
+    weights: Array | None,
+    mask: Array | None,
+    ones: Array,
+    *,
+    coordinates: int,
+    views: int,
+) -> Weighed:
+    """As :func:`weigh`, in any order of axes, and which pixels are finite.
+
+    Args:
+        pixels: float64; those of unused views may hold anything.
+        weights: in the order of the pixels, without coordinates.
+        mask: likewise.
+        ones: the weights that stand for none.
+        coordinates: the axis of x and y.
+        views: the axis of views, without coordinates.
+    """
+    finite = None
+    if not (pixels.min() > -_FARTHEST and pixels.max() < _FARTHEST):  # NaN is not
+        finite = np.abs(pixels).max(axis=coordinates) < _FARTHEST
+    if weights is None and mask is None:
+        size = ones
+    else:
+        size = np.abs((np.ones(()) if weights is None else weights).astype(np.float64))
+        if mask is not None:
+            size = np.where(mask, size, 0.0)
+    largest = size.max(axis=views, keepdims=True)
+    share = size / largest
+    if finite is None and share.min() > NEGLIGIBLE_WEIGHT:  # inf / inf is not
+        every = np.ones_like(ones, dtype=bool)
+        return Weighed(pixels, share, largest, every, np.all(every, axis=views))
+    share, largest, unused, counted = _shares(size, size, largest, np.where)
+    used, sound = ~unused, counted.squeeze(axis=views)
+    if finite is not None:
+        share = np.where(finite, share, 0.0)
+        sound = (finite | unused).all(axis=views) & sound
+        pixels = np.where(np.expand_dims(finite, coordinates), pixels, 0.0)
+    return Weighed(pixels, share, largest, used, sound)

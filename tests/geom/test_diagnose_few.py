@@ -59,3 +59,13 @@ def test_wrong_focal_lengths_are_no_crop_and_no_other_size(factor: float) -> Non
     assert found.factor == pytest.approx(1 / factor, rel=0.02)
     assert f"K[..., :2, :2] *= {found.factor:.4g}" in found.cure
     torch.testing.assert_close(found.mended.views.K, K, rtol=0.02, atol=0)
+
+
+def test_cameras_that_see_nothing_are_not_among_the_worst() -> None:
+    K, pose, pixels = a_dozen(0, num_views=3, turning=0.3)
+    pixels[1] = pixels[1].roll(5, 0)
+    pixels[2] = torch.nan
+    found = diagnosed((K, pose, pixels))
+    assert found.cause is Cause.NO_SINGLE_CAUSE and found.camera_residuals[2].isnan()
+    worst = found.sentence.partition(" px off ")[2]
+    assert "camera 0" in worst and "camera 2" not in worst and "nan" not in worst, worst

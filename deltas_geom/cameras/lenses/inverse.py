@@ -10,13 +10,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.lenses.angles import root
-from deltas_geom.cameras.lenses.terms import (
-    Pair,
-    Terms,
-    distort_and_derive,
-    gain,
-    image_radius,
-)
+from deltas_geom.cameras.lenses.terms import Pair, Terms, distort_and_derive, gain, image_radius
 from deltas_geom.numerics.arithmetic import surely_all, values_at_hand, without_gradients
 from deltas_geom.numerics.vectors import either
 from deltas_geom.records import mapped

@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.lenses.models import MODELS, names_like
+from deltas_geom.cameras.lenses.models import MODELS
 from deltas_geom.cameras.lenses.parameters import from_parameters, in_a_row, opencv, to_parameters
 from deltas_geom.cameras.lenses.through import pixels_of_points, rays_of_pixels
 from deltas_geom.checks import ShapeError, check_shapes
@@ -91,8 +91,12 @@ class Lens:
             ValueError: no such model.
         """
         if model not in MODELS:
-            near = "".join(f": did you mean {name}?" for name in names_like(str(model)))
-            raise ValueError(f"no camera model {model!r}{near or f': take one of {list(MODELS)}'}")
+            import difflib
+
+            named = str(model).upper().replace("-", "_")
+            near = difflib.get_close_matches(named, MODELS, n=1, cutoff=0.4)
+            cure = f"did you mean {near[0]}?" if near else f"take one of {list(MODELS)}"
+            raise ValueError(f"no camera model {model!r}: {cure}")
         return MODELS[model].coefficients
 
     def project(self, points: Tensor) -> LensPixels:

@@ -14,11 +14,10 @@ itself is distorted, by a prism behind the lens, that is undone first.
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom.cameras.lenses.closed import Coefficients, Seen
@@ -26,8 +25,8 @@ from deltas_geom.cameras.lenses.models import Model
 from deltas_geom.cameras.lenses.tables import Table, table_of
 from deltas_geom.numerics.arithmetic import outside_gradients
 from deltas_geom.numerics.chunks import alike
+from deltas_geom.numerics.vectors import Array
 
-Array = NDArray[Any]
 MANY = 32768
 """Pixels from which on a table is worth being made."""
 _CHUNK = 25600
@@ -56,12 +55,17 @@ class RaysOfMany(NamedTuple):
 
     def __call__(self, pixels: Tensor) -> _Rays:
         """Rays ``(*B, N, 3)`` of pixels ``(*B, N, 2)``, and which are valid ``(*B, N)``."""
-        buffers = _Buffers.of(alike(pixels.shape[:-1].numel(), _CHUNK))
+        count = alike(pixels.shape[:-1].numel(), _CHUNK)
+        # What lies between pixels and rays; it stays in the cache.
+        buffers = np.empty((6, count)), np.empty(count, dtype=np.intp)
         with np.errstate(all="ignore"):
-            return _filled(partial(self._some, buffers), pixels)
+            return _filled(partial(self._some, *buffers), pixels)
 
-    def _some(self, buffers: "_Buffers", pixels: Tensor, rays: Tensor, valid: Tensor) -> None:
-        u, v, s, b, place, work, whole = buffers.first(len(pixels))
+    def _some(
+        self, buffers: Array, whole: Array, pixels: Tensor, rays: Tensor, valid: Tensor
+    ) -> None:
+        u, v, s, b, place, work = buffers[:, : len(pixels)]
+        whole = whole[: len(pixels)]
         placed = self.plane(pixels.numpy(), u, v)
         np.multiply(u, u, out=s)
         np.multiply(v, v, out=work)
@@ -109,28 +113,6 @@ def _filled(some: Callable[[Tensor, Tensor, Tensor], None], pixels: Tensor) -> _
         part = slice(start, start + few)
         some(flat[part], rays[part], valid[part])
     return rays.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
-
-
-class _Buffers(NamedTuple):
-    """What lies between pixels and rays; it stays in the cache."""
-
-    u: Array
-    v: Array
-    s: Array
-    b: Array
-    place: Array
-    work: Array
-    whole: Array
-
-    @classmethod
-    def of(cls, count: int) -> "_Buffers":
-        """For so many pixels."""
-        u, v, s, b, place, work = (np.empty(count) for _ in range(6))
-        return cls(u, v, s, b, place, work, np.empty(count, dtype=np.intp))
-
-    def first(self, count: int) -> "_Buffers":
-        """For fewer pixels."""
-        return self if count == len(self.u) else type(self)(*(each[:count] for each in self))
 
 
 def _along_x(K: Array, pixels: Array, u: Array, v: Array) -> None:

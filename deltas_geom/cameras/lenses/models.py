@@ -4,7 +4,7 @@ Source: COLMAP's src/colmap/sensor/models.h states each model; OPENCV_THIN_PRISM
 twelve coefficients, for which COLMAP has no name.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -96,10 +96,7 @@ MODELS: dict[str, Model] = {
     "RADIAL_FISHEYE": _angles("k1 k2", 1, radial="k1 k2"),
     "OPENCV_FISHEYE": _angles("k1 k2 k3 k4", radial="k1 k2 k3 k4"),
     "THIN_PRISM_FISHEYE": _angles(
-        "k1 k2 p1 p2 k3 k4 sx1 sy1",
-        radial="k1 k2 k3 k4",
-        tangential=_TANGENTIAL,
-        prism="sx1 sy1",
+        "k1 k2 p1 p2 k3 k4 sx1 sy1", radial="k1 k2 k3 k4", tangential=_TANGENTIAL, prism="sx1 sy1"
     ),
     # Source: https://facebookresearch.github.io/projectaria_tools, "Fisheye624".
     "RAD_TAN_THIN_PRISM_FISHEYE": _angles(
@@ -111,10 +108,3 @@ MODELS: dict[str, Model] = {
     "EQUIRECTANGULAR": _closed("", 2, closed.panorama_pixels, closed.panorama_rays),
 }
 """COLMAP writes width and height in place of the focal lengths of EQUIRECTANGULAR."""
-
-
-def names_like(name: str) -> Sequence[str]:
-    """The name of the table nearest to one that is not in it."""
-    import difflib
-
-    return difflib.get_close_matches(name.upper().replace("-", "_"), MODELS, n=1, cutoff=0.4)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.lenses.models import MODELS
+from deltas_geom.cameras.pixels import intrinsics
 from deltas_geom.checks import ShapeError, batch_shape, check_shapes
 from deltas_geom.numerics.arithmetic import promoted
 
@@ -50,16 +51,13 @@ def from_parameters(model: str, params: Tensor) -> tuple[Tensor, Tensor]:
         )
     if model == _PANORAMA:
         width, height = params.unbind(dim=-1)
-        focal, cx, cy = [width / (2 * math.pi), height / math.pi], width / 2, height / 2
+        fx, fy, cx, cy = width / (2 * math.pi), height / math.pi, width / 2, height / 2
     else:
         focals = MODELS[model].focals
-        focal = [params[..., 0], params[..., focals - 1]]
+        fx, fy = params[..., 0], params[..., focals - 1]
         cx, cy = params[..., focals], params[..., focals + 1]
         params = params[..., focals + 2 :]
-    none, one = torch.zeros_like(cx), torch.ones_like(cx)
-    entries = [focal[0], none, cx - 0.5, none, focal[1], cy - 0.5, none, none, one]
-    K = torch.stack(entries, dim=-1).reshape(*cx.shape, 3, 3)
-    return K, params[..., :0] if model == _PANORAMA else params
+    return intrinsics(fx, fy, cx - 0.5, cy - 0.5), params[..., :0] if model == _PANORAMA else params
 
 
 def to_parameters(model: str, K: Tensor, coefficients: Tensor) -> Tensor:

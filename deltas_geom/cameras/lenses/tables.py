@@ -8,12 +8,12 @@ arithmetic is known, and not read.
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from deltas_geom.numerics.vectors import Array
+
 _PANELS, _DEGREE, _PIECES = 16, 15, 128  # pieces of a panel
 # Of values at 0, 1/3, 2/3 and 1 less the first, the coefficients of x, x^2 and x^3.
 _CUBIC = np.array([[9.0, -4.5, 1.0], [-22.5, 18.0, -4.5], [13.5, -13.5, 4.5]])

@@ -11,6 +11,7 @@ Source: Brown, Close-range camera calibration, 1971; OpenCV's calibration docume
 
 import math
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import NamedTuple
 
 import torch
@@ -155,28 +156,20 @@ def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
     """
     limit = min(most, _FARTHEST)
     one = torch.ones_like(next(c for part in terms for c in part))
-    # Coefficients of powers of t, in a list; those of powers of r lie between.
+    # Coefficients of powers of t, in a list.
     above, below = [one, *terms.radial], [one, *terms.divided]
-    steepness = _product(above, below)
+    steepness = [torch.zeros_like(one) for _ in [*above, *below[1:]]]
     for i, a in enumerate(above):
         for k, b in enumerate(below):
-            if i != k:
-                steepness[i + k] = torch.addcmul(steepness[i + k], a, b, value=2 * (i - k))
-    of_r = [part for each in steepness for part in (each, torch.zeros_like(one))][:-1]
-    if not terms.only_radial:
-        taken = [torch.zeros_like(one) for _ in range(4)]
-        if terms.tangential:
-            taken[1] = taken[1] - 6 * torch.hypot(*terms.tangential)
-        if terms.prism:
-            taken[1] = taken[1] - 2 * torch.hypot(*terms.prism[:2])
-        if terms.prism[2:]:
-            taken[3] = taken[3] - 4 * torch.hypot(*terms.prism[2:])
-        squared = _product(below, below)
-        squared = [part for each in squared for part in (each, torch.zeros_like(one))][:-1]
-        of_r = _sum(of_r, _product(taken, squared))
-        first = _first_root(of_r[1:])
-    else:
+            steepness[i + k] = torch.addcmul(steepness[i + k], a, b, value=1 + 2 * (i - k))
+    if terms.only_radial:
         first = _first_root(steepness[1:]).sqrt()
+    else:
+        # What the others take has the odd powers of r.
+        p, s1, s2 = _sizes(terms, one)
+        odd = _product([-6 * p - 2 * s1, -4 * s2], _product(below, below))
+        pairs = zip_longest(steepness, odd, fillvalue=torch.zeros_like(one))
+        first = _first_root([part for pair in pairs for part in pair][1:])
     if terms.divided:
         # At a pole itself there is no number.
         pole = _first_root(list(terms.divided)).sqrt() * (1 - 1e-9)
@@ -186,36 +179,29 @@ def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
 
 def image_radius(terms: Terms, within: Tensor) -> Tensor:
     """A circle outside of which nothing of the disc ``within`` goes, ``(*B, 1)``."""
-    t = within * within
-    radius = within * gain(terms, t)[0]
-    if terms.tangential:
-        radius = radius + 3 * torch.hypot(*terms.tangential) * t
-    if terms.prism:
-        radius = radius + torch.hypot(*terms.prism[:2]) * t
-    if terms.prism[2:]:
-        radius = radius + torch.hypot(*terms.prism[2:]) * t * t
+    t, (p, s1, s2) = within * within, _sizes(terms, within)
+    radius = within * gain(terms, t)[0] + (3 * p + s1 + s2 * t) * t
     return radius * (1 + 1e-9)
 
 
+def _sizes(terms: Terms, like: Tensor) -> list[Tensor]:
+    """Lengths of p, s1 and s2, 0 for those that there are not."""
+    none = torch.zeros_like(like)
+    vectors = terms.tangential, terms.prism[:2], terms.prism[2:]
+    return [torch.hypot(*vector) if vector else none for vector in vectors]
+
+
 def _product(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
-    if len(b) == 1:
-        return [b[0] * each for each in a]
-    found: list[Tensor] = [torch.zeros_like(a[0] * b[0]) for _ in range(len(a) + len(b) - 1)]
+    """Coefficients of the product of two polynomials."""
+    found = [torch.zeros_like(a[0]) for _ in [*a, *b[1:]]]
     for i, first in enumerate(a):
         for k, second in enumerate(b):
             found[i + k] = torch.addcmul(found[i + k], first, second)
     return found
 
 
-def _sum(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
-    longer, shorter = (a, b) if len(a) >= len(b) else (b, a)
-    return [x + shorter[k] if k < len(shorter) else x for k, x in enumerate(longer)]
-
-
 def _first_root(coefficients: Sequence[Tensor]) -> Tensor:
     """The smallest positive root of 1 + c1 z + c2 z^2 + ..., infinite if there is none."""
-    if not coefficients:
-        raise ValueError("a polynomial of degree 0 has no roots")
     c = torch.stack(list(coefficients), dim=-1)
     size = c.shape[-1]
     # The companion matrix of z^n times the polynomial of 1/z, whose leading coefficient is 1.

@@ -132,12 +132,7 @@ def _pixels(
 
 
 def _rays(
-    model: str,
-    derivable: bool,
-    K: Tensor,
-    coefficients: Tensor,
-    reach: Tensor,
-    pixels: Tensor,
+    model: str, derivable: bool, K: Tensor, coefficients: Tensor, reach: Tensor, pixels: Tensor
 ) -> _Both:
     # Beyond that many px a float64 knows no pixel, nor its square.
     xy, finite = finite_or_zero(pixels.to(K.dtype), limit=_LARGEST)

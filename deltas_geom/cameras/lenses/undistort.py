@@ -9,7 +9,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.lenses.lens import Lens, LensPixels
-from deltas_geom.cameras.pixels import in_image, pixel_grid, read_map
+from deltas_geom.cameras.pixels import in_image, intrinsics, pixel_grid, read_map
 from deltas_geom.cameras.projection import pixel_rays
 from deltas_geom.checks import ShapeError, batch_shape, check_image_size, check_kind, check_shapes
 from deltas_geom.numerics.arithmetic import (
@@ -190,11 +190,8 @@ def pinhole_K(
     height, width = new_size
     fx, cx = _mixed(inner[:2], outer[:2], width, alpha)
     fy, cy = _mixed(inner[2:], outer[2:], height, alpha)
-    none, one = torch.zeros_like(fx), torch.ones_like(fx)
-    K = torch.stack([fx, none, cx, none, fy, cy, none, none, one], dim=-1)
-    return K.reshape(*K.shape[:-1], 3, 3).to(
-        torch.promote_types(lens.dtype, lens.coefficients.dtype)
-    )
+    dtype = torch.promote_types(lens.dtype, lens.coefficients.dtype)
+    return intrinsics(fx, fy, cx, cy).to(dtype)
 
 
 def _mixed(
