@@ -116,11 +116,17 @@ def resize_pixels(
 ) -> Tensor:
     """Where pixels ``(*B, 2)`` of an image go when it is resized; what is NaN stays so.
 
+    Raises:
+        ShapeError: pixels are not ``(*B, 2)``.
+        ValueError: a size is smaller than one pixel.
+
     Example:
         >>> resize_pixels(torch.tensor([0.0, 0.0]), old_size=(4, 4), new_size=(2, 2))
         tensor([-0.2500, -0.2500])
     """
     check_shapes(pixels=(pixels, "2"))
+    check_image_size(old_size)
+    check_image_size(new_size)
     along_x, along_y = new_size[1] / old_size[1], new_size[0] / old_size[0]
     # As above: numbers of the host would be waited for.
     scale = torch.linspace(along_x, along_y, 2, device=pixels.device, dtype=pixels.dtype)

@@ -143,6 +143,12 @@ OF_OTHER_KIND: dict[str, Callable[[Any], Any]] = {
     "lens must be Lens, got Tensor: use Lens(": lambda g: g.undistort_pixels(POSED.K, PIXELS),
     "covariance must be a torch.Tensor": lambda g: g.depth_variance(PROJ, None),
     "image_size must be (height, width)": lambda g: g.pixel_grid((3, 4, 5)),
+    "must be (height, width) >= (1, 1), got (0, 2)": lambda g: g.resize_pixels(
+        PIXELS, old_size=(0, 2), new_size=(2, 2)
+    ),
+    "mode must be 'bilinear' or 'nearest', got 'x'": lambda g: g.undistort_image(
+        g.Lens(POSED.K, torch.zeros(0), "PINHOLE"), torch.zeros(3, 4, 4), mode="x"
+    ),
     "depth_range must be (near, far)": lambda g: g.triangulate(PROJ, PIXELS).within_depth(10.0),
     "samples has sources = 1 but feature_map has sources = 2": lambda g: g.correlate(
         torch.zeros(6, 8),

@@ -116,7 +116,8 @@ def undistort_image(
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
-        ValueError: ``alpha`` is not in [0, 1], or a size is smaller than one pixel.
+        ValueError: ``alpha`` is not in [0, 1], a size is smaller than one pixel, or ``mode`` is
+            neither.
 
     Example:
         >>> K = torch.tensor([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
@@ -131,6 +132,8 @@ def undistort_image(
         raise ShapeError(f"image ends in channels, {tuple(image.shape)}: use image.movedim(-1, -3)")
     if not 0 <= alpha <= 1:
         raise ValueError(f"alpha must be from 0 (all seen) to 1 (all kept), got {alpha}")
+    if mode not in ("bilinear", "nearest"):
+        raise ValueError(f"mode must be 'bilinear' or 'nearest', got {mode!r}")
     # In a trace sizes are tensors, which would divide in float32.
     old_size = (int(image.shape[-2]), int(image.shape[-1]))
     new_size = old_size if new_size is None else new_size
