@@ -100,7 +100,8 @@ def check_bool(**named: Tensor | None) -> None:
     """Raise ``TypeError`` unless every mask given is bool: numbers may mean weights, or indices."""
     for name, mask in named.items():
         if mask is not None and mask.dtype != torch.bool:
-            raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}")
+            cure = f"use {name} != 0, unless its numbers are weights or indices"
+            raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}: {cure}")
 
 
 def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:

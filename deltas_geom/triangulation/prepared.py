@@ -55,6 +55,13 @@ class PreparedTriangulator:
         self.max_residual = max_residual
         self._renew()
 
+    def __repr__(self) -> str:
+        """The settings and whose cameras they are: no numbers."""
+        shape, dtype = tuple(self.proj.shape), str(self.proj.dtype).removeprefix("torch.")
+        settings = f"frame={self.frame!r}, covariance={self.covariance}"
+        settings = f"{settings}, max_residual={self.max_residual}"
+        return f"{type(self).__name__}(proj {shape}, {settings}) {dtype} {self.proj.device}"
+
     def _renew(self) -> None:
         self._cameras = KnownCameras(at_least_single(self.proj))
         self._version = _version_of(self.proj)
