@@ -21,8 +21,8 @@ class PreparedTriangulator:
 
     Answers and gradients, also those by the cameras, are those of :func:`triangulate`. Cameras that
     are changed in place are noticed, and looked at anew; not so through ``proj.data`` or a NumPy
-    array behind ``proj``. It is no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to`
-    moves it.
+    array behind ``proj``, nor others that ``torch.func.functional_call`` lends to a network. It is
+    no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to` moves it.
 
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
