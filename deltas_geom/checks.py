@@ -7,7 +7,6 @@ from torch import Tensor
 
 _NUMBERS = {str(number): number for number in range(1000)}
 _MASKS = ("mask", "used")
-_CURES = {"ndarray": "torch.from_numpy({0})", "PosedViews": "{0}.proj, or a field of it"}
 
 
 class ShapeError(ValueError):
@@ -83,10 +82,20 @@ def check_tensor(**named: object) -> None:
     """Raise ``TypeError`` with the cure unless all are tensors."""
     for name, value in named.items():
         if not isinstance(value, Tensor):
-            kind = type(value).__name__
-            cure = _CURES.get(kind, "torch.stack({0}) or torch.tensor({0})").format(name)
-            cure = f": use {cure}" if kind in (*_CURES, "list", "tuple") else ""
+            kind, cure = type(value).__name__, _cure(name, value)
+            cure = f": use {cure}" if cure else ""
             raise TypeError(f"{name} must be a torch.Tensor, got {kind}{cure}")
+
+
+def _cure(name: str, value: object) -> str:
+    """What to give instead of what is no tensor; empty where nobody knows."""
+    if type(value).__name__ == "ndarray":
+        return f"torch.from_numpy({name})"
+    fields: tuple[str, ...] = getattr(value, "_fields", ())
+    if fields:  # a record; PosedViews.proj is none of its fields
+        own = hasattr(value, name)
+        return f"{name}.{name}" if own else f"one of its fields, {', '.join(fields)}"
+    return f"torch.stack({name}) or torch.tensor({name})" if isinstance(value, list | tuple) else ""
 
 
 def check_kind(name: str, value: object, kind: type, cure: str) -> None:
@@ -100,7 +109,8 @@ def check_bool(**named: Tensor | None) -> None:
     """Raise ``TypeError`` unless every mask given is bool: numbers may mean weights, or indices."""
     for name, mask in named.items():
         if mask is not None and mask.dtype != torch.bool:
-            raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}")
+            cure = f"use {name} != 0, unless its numbers are weights or indices"
+            raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}: {cure}")
 
 
 def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:

@@ -1,7 +1,7 @@
 """The operations as modules, for pipelines that are built from modules."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor, nn
 
@@ -14,8 +14,20 @@ from deltas_geom.triangulation.prepared import PreparedTriangulator
 from deltas_geom.triangulation.results import Triangulation
 
 
-class EpipolarSampler(nn.Module):
+class _Fixed(nn.Module):
+    """A module without parameters, which prints its settings."""
+
+    settings: ClassVar[tuple[str, ...]]
+
+    def extra_repr(self) -> str:
+        """The settings, where a network is printed."""
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in self.settings)
+
+
+class EpipolarSampler(_Fixed):
     """:func:`epipolar_segments` and :func:`sample_segments` with fixed settings."""
+
+    settings = ("num_samples", "depth_range", "spacing", "offsets")
 
     def __init__(
         self,
@@ -45,8 +57,10 @@ class EpipolarSampler(nn.Module):
         )
 
 
-class Triangulator(nn.Module):
+class Triangulator(_Fixed):
     """:func:`triangulate` with fixed settings."""
+
+    settings = ("frame", "covariance", "max_residual")
 
     def __init__(
         self,
@@ -78,8 +92,10 @@ class Triangulator(nn.Module):
         )
 
 
-class DepthRasterizer(nn.Module):
+class DepthRasterizer(_Fixed):
     """:func:`rasterize_depth` with fixed settings."""
+
+    settings = ("reduce", "splat")
 
     def __init__(
         self,

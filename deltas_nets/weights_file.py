@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from textwrap import shorten
@@ -68,8 +68,16 @@ def load_network(name_or_file: str | Path, device: str | torch.device = "cpu") -
     return model.to(device).eval()
 
 
-def weights_file(name_or_file: str | Path) -> Path:
-    """The file of a shipped network's name, or the given file."""
+def weights_file(name_or_file: str | Path, *, beside: Iterable[str] = ()) -> Path:
+    """The file of a shipped network's name, or the given file.
+
+    Args:
+        name_or_file: of the weights.
+        beside: names without a file that whoever asks takes as well, to be told.
+
+    Raises:
+        UserError: there is no such file.
+    """
     file = Path(name_or_file)
     shipped = Path(str(files("deltas_nets") / "weights" / f"{name_or_file}.safetensors"))
     if file.suffix != ".safetensors" and shipped.is_file():
@@ -79,7 +87,8 @@ def weights_file(name_or_file: str | Path) -> Path:
         remedy = f"name {inside}" if inside.is_file() else "name a .safetensors file"
         raise UserError("this is a folder, not weights", file, remedy)
     if not file.is_file():
-        known = f"one of {', '.join((DEFAULT, *BASELINES))}"
+        names = (DEFAULT, *beside)
+        known = f"one of {', '.join(names)}" if len(names) > 1 else DEFAULT
         if str(name_or_file) in BASELINES:
             known = f"{DEFAULT}: {file} has none"
         raise UserError("no such weights", file, f"name a .safetensors file or {known}")

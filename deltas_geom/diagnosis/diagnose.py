@@ -46,7 +46,8 @@ def diagnose(
 
     What matches cannot tell is not guessed: causes that explain as much are all named
     (``alternatives``), and where all is well, those whose cure would change nothing (``untold``).
-    Cameras that do not turn say nothing of K and little of poses.
+    Cameras that do not turn say nothing of K and little of poses. Matches must have been found
+    without the cameras: those searched on epipolar lines always fit the cameras of these lines.
 
     Args:
         views: V cameras without batch dims.

@@ -9,7 +9,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.pixels import in_image, read_map
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_batch, check_image_size, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_image_size, check_kind, check_shapes
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
@@ -37,8 +37,14 @@ class Samples(Record):
     mask: Tensor
 
 
+def check_samples(samples: object) -> None:
+    """Raise ``TypeError`` with the cure for anything else, such as segments or pixels."""
+    check_kind("samples", samples, Samples, "sample_segments(...) or sample_inv_depths(...)")
+
+
 def check_scores(keypoints: Tensor, scores: Tensor, samples: Samples, dims: str) -> None:
     """Raise as :func:`check_shapes` unless scores of these dims are of the samples of keypoints."""
+    check_samples(samples)
     check_shapes(
         keypoints=(keypoints, "N 2"),
         scores=(scores, dims),
@@ -74,6 +80,7 @@ def sample_segments(
     """
     if num_samples < 2:
         raise ValueError(f"num_samples must be at least 2, got {num_samples}")
+    check_kind("segments", segments, Segments, "epipolar_segments(...)")
     check_shapes(
         start=(segments.start, "S N 2"),
         end=(segments.end, "S N 2"),

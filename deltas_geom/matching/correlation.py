@@ -14,7 +14,7 @@ from torch import Tensor
 
 from deltas_geom.cameras.pixels import normalizing
 from deltas_geom.checks import batch_shape, check_bool, check_shapes, tracing
-from deltas_geom.epipolar.sampling import Samples
+from deltas_geom.epipolar.sampling import Samples, check_samples
 from deltas_geom.matching.lengths import inverse_lengths, length_table
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
@@ -61,6 +61,7 @@ def correlate(
         >>> correlate(torch.tensor([[2.0, 1.0]]), row, samples, image_size=(1, 2)).squeeze()
         tensor([ 2.,  6., 10.])
     """
+    check_samples(samples)
     check_shapes(
         descriptors=(descriptors, "N D"),
         feature_map=(feature_map, "sources D +h +w"),

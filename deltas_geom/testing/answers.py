@@ -89,6 +89,12 @@ def checked(target: str, feature: str, function: Function, remarks: list[str]) -
             if "numpy() on Tensor that requires grad" in str(error):
                 remarks.append(f"{feature} uses NumPy: give the target differentiable=False")
             raise
+        except TypeError as error:
+            # Raised by the call itself, not by what it called.
+            if error.__traceback__ is not None and error.__traceback__.tb_next is None:
+                names = ", ".join(one.wanted for one in takes)
+                remarks.append(f"{feature} is called with {len(copies)} arguments: {names}")
+            raise
         parts = _tensors(where, found, returns)
         _check_arguments(where, takes, arguments, copies)
         _check_shapes(where, takes, arguments, parts, returns)

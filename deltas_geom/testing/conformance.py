@@ -53,6 +53,7 @@ def conformance(targets: Iterable[Target]) -> list[Outcome]:
     """Ask every target for every invariant.
 
     Raises:
+        TypeError: what is asked is no target, or is not a list of them.
         ValueError: two targets have one name.
 
     Example:
@@ -61,7 +62,15 @@ def conformance(targets: Iterable[Target]) -> list[Outcome]:
         >>> [outcome.invariant for outcome in outcomes if outcome.result == "FAIL"]
         ['points_move_with_the_world', ...]
     """
+    if isinstance(targets, Target):
+        raise TypeError("targets must be a list of Target, got one: use [target]")
     targets = list(targets)
+    for target in targets:
+        if not isinstance(target, Target):
+            kind = type(target).__name__
+            raise TypeError(
+                f'targets must be a list of Target, got a {kind} in it: use Target("mine", ...)'
+            )
     for name, count in Counter(target.name for target in targets).items():
         if count > 1:
             raise ValueError(f"{count} targets are named {name!r}: give each its own name")

@@ -21,8 +21,8 @@ class PreparedTriangulator:
 
     Answers and gradients, also those by the cameras, are those of :func:`triangulate`. Cameras that
     are changed in place are noticed, and looked at anew; not so through ``proj.data`` or a NumPy
-    array behind ``proj``. It is no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to`
-    moves it.
+    array behind ``proj``, nor others that ``torch.func.functional_call`` lends to a network. It is
+    no ``nn.Module``: ``net.to(...)`` leaves it behind, :meth:`to` moves it.
 
     Args:
         proj: ``(*B, V, 3, 4)`` K [R | t].
@@ -54,6 +54,13 @@ class PreparedTriangulator:
         self.covariance = covariance
         self.max_residual = max_residual
         self._renew()
+
+    def __repr__(self) -> str:
+        """The settings and whose cameras they are: no numbers."""
+        shape, dtype = tuple(self.proj.shape), str(self.proj.dtype).removeprefix("torch.")
+        settings = f"frame={self.frame!r}, covariance={self.covariance}"
+        settings = f"{settings}, max_residual={self.max_residual}"
+        return f"{type(self).__name__}(proj {shape}, {settings}) {dtype} {self.proj.device}"
 
     def _renew(self) -> None:
         self._cameras = KnownCameras(at_least_single(self.proj))

@@ -57,7 +57,15 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
 
 
 def parse(arguments: Sequence[str], commands: Commands) -> Command:
-    """The command that the arguments name; one line of error where they make no sense."""
+    """The command that the arguments name; one line of error where they make no sense.
+
+    Raises:
+        TypeError: a command's fields are no flags, as it was not made a dataclass.
+    """
+    for command in commands:
+        if "__dataclass_fields__" not in vars(command):
+            what = f"{command.__name__} in COMMANDS is no dataclass"
+            raise TypeError(f"{what}: put @dataclass(frozen=True) above it")
     said = io.StringIO()
     names = {command.__name__.lower(): command for command in commands}
     groups = names[arguments[0]].groups if arguments[0] in names else {}
@@ -67,7 +75,7 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
         _fail(error)
     try:
         with contextlib.redirect_stderr(said), _shown_by(groups):
-            command: Command = tyro.cli(
+            asked: Command = tyro.cli(
                 kinds,
                 prog="deltas",
                 description="Metric depth from posed images.",
@@ -82,7 +90,7 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
         what = sentence(_in_words(said.getvalue()), names, arguments)
         what = shorten(what, 200, placeholder=" ...")
         _fail(UserError(what, "command line", _help_of(arguments, commands)))
-    return command
+    return asked
 
 
 @contextlib.contextmanager

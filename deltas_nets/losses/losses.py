@@ -76,8 +76,7 @@ def training_losses(
         config.scale_decay,
         divisors,
     )
-    terms = {name: term(seen) for name, term in loss_functions().items()}
-    return _weighed(terms, config, depth)
+    return _weighed({name: _term(name, seen) for name in LOSS_FUNCTIONS}, config, depth)
 
 
 def map_losses(
@@ -98,8 +97,17 @@ def map_losses(
         depth_range: within which the truth counts.
     """
     seen = MapAlone(dense, images, depth, depth_range, config.scale_decay)
-    terms = {name: loss_functions()[name](seen) for name in MAP_TERMS}
-    return _weighed(terms, config, depth)
+    return _weighed({name: _term(name, seen) for name in MAP_TERMS}, config, depth)
+
+
+def _term(name: str, seen: Seen | MapAlone) -> Tensor:
+    """A term, which must be a scalar: anything else fails far from the loss that returned it."""
+    term = loss_functions()[name](seen)
+    if not isinstance(term, Tensor) or term.shape != ():
+        got = f"shape {tuple(term.shape)}" if isinstance(term, Tensor) else type(term).__name__
+        place = LOSS_FUNCTIONS[name]
+        raise TypeError(f"the loss {name} ({place}) must return a scalar tensor, got {got}")
+    return term
 
 
 def _weighed(terms: dict[str, Tensor], config: LossConfig, like: Tensor) -> Losses:

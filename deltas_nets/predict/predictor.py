@@ -145,7 +145,7 @@ def load_predictor(
         _check_float32(precision, str(name_or_file))
         baseline: Predictor = look_up("deltas_nets.baselines", BASELINES[str(name_or_file)])(device)
         return baseline
-    file = weights_file(name_or_file)
+    file = weights_file(name_or_file, beside=BASELINES)
     if reference.is_published(file):
         _check_float32(precision, "the reference network")
         return ReferencePredictor(reference.load(file, device=device))

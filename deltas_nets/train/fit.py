@@ -1,6 +1,7 @@
 """The training loop: one step after another, with everything that survives a kill."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,6 +16,7 @@ from deltas_nets.errors import UserError
 from deltas_nets.evaluate.rooms import evaluate_rooms
 from deltas_nets.outputs.atomic_files import remove_temporary
 from deltas_nets.rooms import Rooms
+from deltas_nets.terminal import counted
 from deltas_nets.train.batches import BatchMaker
 from deltas_nets.train.checkpoint import WEIGHTS, save_run
 from deltas_nets.train.data_sets import training_data, validation_data
@@ -96,7 +98,7 @@ def fit(
         folder.mkdir(parents=True, exist_ok=True)
         remove_temporary(folder.iterdir())
     save()  # before the first step, so that a run can always be resumed
-    failures = 0
+    failures, without_use = 0, Counter[str]()
     log_of_run = _log(fabric, folder, config, step, report)
     with StopRequest(tells=fabric.is_global_zero) as request, log_of_run as log:
 
@@ -116,7 +118,9 @@ def fit(
             rate = set_learning_rate(state.optimizer, step, config)
             batch = maker(rooms, step)
             result = stepper(batch, stop=request.made)
-            if result.done:
+            if not result.done:
+                without_use.update([", ".join(result.not_finite)])
+            else:
                 state.average.update(state.model, step)
             step += 1
             if step % log_every == 0 or step == last:
@@ -126,7 +130,8 @@ def fit(
             failures = 0 if result.done else failures + 1
             if failures == PATIENCE:
                 what = f"training diverged: no usable gradient in the {PATIENCE} steps up to {step}"
-                raise UserError(what, folder, "lower --learning-rate")
+                what = f"{what}; not finite: {', '.join(result.not_finite)}"
+                raise UserError(what, folder, "lower --learning-rate, or mend a loss of your own")
             stopped = result.stop and step < last
             if stopped or step % checkpoint_every == 0 or step == last:
                 save()
@@ -134,6 +139,8 @@ def fit(
                 fabric.barrier()  # torchrun ends the others when one is gone
                 raise KeyboardInterrupt
             validate_at(step)
+    for names, count in without_use.items():
+        tell(f"{counted(count, 'step')} changed nothing; not finite: {names}")
     fabric.barrier()
     return folder / WEIGHTS
 

@@ -1,6 +1,7 @@
 """One optimiser step: by one process or many, in one pass or several, the same."""
 
 import copy
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -78,6 +79,12 @@ class StepResult(NamedTuple):
     losses: dict[str, float]
     done: bool
     stop: bool
+
+    @property
+    def not_finite(self) -> list[str]:
+        """What was not: terms of the loss, or the gradient where all of them were."""
+        terms = [name for name, value in self.losses.items() if not math.isfinite(value)]
+        return [name for name in terms if name != "total" or len(terms) == 1] or ["the gradient"]
 
 
 class Stepper:

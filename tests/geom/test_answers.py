@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from hypothesis import given
+from torch import Tensor
 from wrong import OURS, after, before, ours
 
 from deltas_geom.testing import (
@@ -182,3 +183,24 @@ def test_the_square_of_weights_is_seen_in_two_views_of_any_scene(scene: PosedSce
             wrong = before("mine", "triangulate", lambda p, x, w, power=power: (p, x, w**power))
             with pytest.raises(AssertionError, match=r"^[12]\.?\d* instead of 4 at "):
                 heeded(replace(wrong, max_views=2, tolerance=tolerance), scene)
+
+
+def test_a_function_that_takes_other_arguments_is_told_which_are_given() -> None:
+    short = Target("mine", triangulate=lambda proj, pixels: pixels[0])  # type: ignore[arg-type, misc]
+    outcome = check("points_are_exact_without_noise", short)
+    told = (
+        "triangulate is called with 3 arguments: proj (V, 3, 4), pixels (V, N, 2), weights (V, N)"
+    )
+    assert told in outcome.example
+
+
+def test_a_type_error_inside_a_function_says_nothing_of_its_arguments() -> None:
+    def inside(proj: Tensor, pixels: Tensor, weights: Tensor | None) -> Tensor:
+        return str(proj) + 1  # type: ignore[operator, return-value]
+
+    def deeper(proj: Tensor, pixels: Tensor, weights: Tensor | None) -> Tensor:
+        return inside(proj, pixels, weights)
+
+    for function in (inside, deeper):
+        outcome = check("points_are_exact_without_noise", Target("mine", triangulate=function))
+        assert "TypeError" in outcome.example and "is called with" not in outcome.example

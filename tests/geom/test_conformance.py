@@ -487,3 +487,19 @@ def _blocks(language: str) -> list[str]:
     """The page's blocks of code in a language."""
     pattern = rf"^```{language}\n(.*?)^```$"
     return re.findall(pattern, DOCS.read_text(), re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (Target("mine"), r"must be a list of Target, got one: use \[target\]"),
+        (
+            [triangulate_points],
+            r"list of Target, got a function in it: use Target\(\"mine\", \.\.\.\)",
+        ),
+        (["torch"], r"list of Target, got a str in it"),
+    ],
+)
+def test_what_is_no_list_of_targets_is_told(asked: Any, told: str) -> None:
+    with pytest.raises(TypeError, match=told):
+        conformance(asked)

@@ -55,3 +55,20 @@ def test_modules_have_nothing_to_learn_or_to_save() -> None:
         [EpipolarSampler(4, depth_range=(1, 2)), Triangulator(), DepthRasterizer()]
     )
     assert not list(modules.parameters()) and not modules.state_dict()
+
+
+def test_modules_and_prepared_cameras_print_their_settings() -> None:
+    net = nn.Sequential(
+        Triangulator(max_residual=4.0),
+        EpipolarSampler(6, depth_range=(0.5, 9.0)),
+        DepthRasterizer(splat="bilinear"),
+    )
+    for said in (
+        "frame='rig', covariance=False, max_residual=4.0",
+        "num_samples=6, depth_range=(0.5",
+    ):
+        assert said in repr(net)
+    assert "reduce='front', splat='bilinear'" in repr(net)
+    rig = Triangulator(max_residual=4.0).prepare(torch.zeros(2, 4, 3, 4))
+    assert repr(rig).startswith("PreparedTriangulator(proj (2, 4, 3, 4), frame='rig', ")
+    assert repr(rig).endswith("max_residual=4.0) float32 cpu")

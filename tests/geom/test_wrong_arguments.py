@@ -132,6 +132,12 @@ def test_indices_of_tracks_are_integers(kind: torch.dtype) -> None:
 
 PROJ, PIXELS = torch.eye(3, 4).expand(2, 3, 4), torch.zeros(2, 6, 2)
 POSED = geom.PosedViews(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4))
+
+
+def segments_of(g: Any) -> Any:
+    return g.epipolar_segments(POSED, PIXELS[0], depth_range=(0.5, 9.0), image_size=SIZE)
+
+
 OF_OTHER_KIND: dict[str, Callable[[Any], Any]] = {
     "views must be PosedViews, got Tensor: use PosedViews": lambda g: g.diagnose(PROJ, PIXELS),
     "proj must be a torch.Tensor, got PosedViews": lambda g: g.Triangulator().prepare(POSED),
@@ -141,6 +147,31 @@ OF_OTHER_KIND: dict[str, Callable[[Any], Any]] = {
     "frame must be 'rig' or 'world', got 'x'": lambda g: g.Triangulator(frame="x"),
     "max_residual must be positive, got -1": lambda g: g.Triangulator(max_residual=-1),
     "lens must be Lens, got Tensor: use Lens(": lambda g: g.undistort_pixels(POSED.K, PIXELS),
+    "samples must be Samples, got Tensor: use sample_segments(...)": lambda g: g.correlate(
+        torch.zeros(6, 8), torch.zeros(1, 8, 5, 5), PIXELS, image_size=SIZE
+    ),
+    "samples must be Samples, got Segments: use sample_segments(": lambda g: g.correlate_normalized(
+        torch.zeros(6, 8), torch.zeros(1, 8, 5, 5), segments_of(g), image_size=SIZE
+    ),
+    "samples must be Samples, got Segments: use sample_segments": lambda g: g.match_per_view(
+        PIXELS[0], torch.zeros(1, 6, 1, 3), segments_of(g)
+    ),
+    "samples must be Samples, got Tensor: use sample_segments": lambda g: g.match_joint(
+        POSED, PIXELS[0], torch.zeros(1, 6, 1, 3), PIXELS, image_size=SIZE
+    ),
+    "segments must be Segments, got Samples: use epipolar_segments(...)": lambda g: (
+        g.sample_segments(g.sample_segments(segments_of(g), 3), 3)
+    ),
+    "points must be a torch.Tensor, got Triangulation: use points.points": lambda g: (
+        g.refine_points(PROJ, PIXELS, g.triangulate(PROJ, PIXELS))
+    ),
+    "pixels must be a torch.Tensor, got Projection: use pixels.pixels": lambda g: g.triangulate(
+        PROJ, g.project(POSED, torch.ones(6, 3))
+    ),
+    "use cam_from_world.cam_from_world": lambda g: g.triangulate_rays(POSED, torch.ones(2, 6, 3)),
+    "got Segments: use one of its fields, start, end, inv_depth_start,": lambda g: g.triangulate(
+        PROJ, segments_of(g)
+    ),
     "covariance must be a torch.Tensor": lambda g: g.depth_variance(PROJ, None),
     "image_size must be (height, width)": lambda g: g.pixel_grid((3, 4, 5)),
     "must be (height, width) >= (1, 1), got (0, 2)": lambda g: g.resize_pixels(

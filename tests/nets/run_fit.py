@@ -100,6 +100,7 @@ def train(
     *,
     stop: int | None = None,
     validate_every: int = 500,
+    report: Callable[[str], None] = lambda message: None,
 ) -> None:
     """Train in this process; validation looks at one small room."""
     rooms, threads = fit_module.validation_rooms, torch.get_num_threads()
@@ -115,7 +116,7 @@ def train(
             validate_every=validate_every,
             log_every=1,
             stop=stop,
-            report=lambda message: None,
+            report=report,
         )
     finally:
         fit_module.validation_rooms = rooms

@@ -52,11 +52,11 @@ def test_the_other_stages_take_the_channels_that_an_encoder_states(
         patch.setattr(Tiny, "channels", Channels(*widths), raising=False)
         config = NetworkConfig(backbone="tiny", descriptor_stride=2 if kind == 2 else 4)
         model = Deltas(config).eval()
-    K = torch.tensor([[40.0, 0, 23.5], [0, 40, 15.5], [0, 0, 1]]).expand(2, 3, 3)
-    pose = torch.eye(4).repeat(2, 1, 1)
-    pose[1, 0, 3] = -0.2
-    with torch.no_grad():
-        depth = model(torch.rand(2, 3, 32, 48), PosedViews(K, pose), num_keypoints=16).depth
+        K = torch.tensor([[40.0, 0, 23.5], [0, 40, 15.5], [0, 0, 1]]).expand(2, 3, 3)
+        pose = torch.eye(4).repeat(2, 1, 1)
+        pose[1, 0, 3] = -0.2
+        with torch.no_grad():
+            depth = model(torch.rand(2, 3, 32, 48), PosedViews(K, pose), num_keypoints=16).depth
     assert depth.shape == (1, 32, 48) and (depth > 0).all()
 
 

@@ -199,13 +199,15 @@ def poison(monkeypatch: pytest.MonkeyPatch, steps: set[int]) -> None:
     monkeypatch.setattr(BatchMaker, "__call__", poisoned)
 
 
-def test_a_step_without_a_usable_gradient_changes_nothing(
+def test_a_step_without_a_usable_gradient_changes_nothing_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    said: list[str] = []
     train(tmp_path / "good", CONFIG, Start(), stop=1)
     poison(monkeypatch, {1, 2})
-    train(tmp_path / "bad", CONFIG, Start(), stop=3)
+    train(tmp_path / "bad", CONFIG, Start(), stop=3, report=said.append)
     assert [entry["total"] for entry in logged(tmp_path / "bad")][1:] == ["nan", "nan"]
+    assert said[-1].startswith("2 steps changed nothing; not finite: detector, smoothness, ")
     good, bad = (read_checkpoint(tmp_path / name) for name in ("good", "bad"))
     assert (good["step"], bad["step"]) == (1, 3)
     for part in ("model", "average"):  # the running statistics of batch norm among them
@@ -216,7 +218,7 @@ def test_a_step_without_a_usable_gradient_changes_nothing(
 def test_training_that_diverges_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "PATIENCE", 3)
     poison(monkeypatch, {0, 1, 3, 4, 5})
-    with pytest.raises(UserError, match=r"no usable gradient in the 3 steps up to 6.*lower --lear"):
+    with pytest.raises(UserError, match=r"in the 3 steps up to 6; not finite: dete.*lower --lear"):
         fit(CONFIG, tmp_path, Start())
 
 

@@ -9,6 +9,9 @@ from deltas_nets.network.encoder import ImageEncoder
 from deltas_nets.network.features import Channels, Features
 from deltas_nets.network.layers import ConvBlock
 
+STRIDES = (2, 2, 4, 8, 16)
+"""Of the maps of :class:`Features`."""
+
 
 class LiteEncoder(ImageEncoder):
     """RGB images in [0, 1], any size, to :class:`Features`.
@@ -36,7 +39,30 @@ class LiteEncoder(ImageEncoder):
         """Encode ``(B, V, 3, H, W)``."""
         flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         maps = [self.fine(flat), *self.taps(flat)]
+        self._check(maps, (images.shape[-2], images.shape[-1]))
         return Features(*(each.unflatten(0, images.shape[:2]) for each in maps))
+
+    def _check(self, maps: list[Tensor], image_size: tuple[int, int]) -> None:
+        """Whether maps are those that the other stages are built for.
+
+        Raises:
+            ValueError: too few or many of them, or one of other channels or another size.
+        """
+        who = type(self).__name__
+        if len(maps) != len(STRIDES):
+            taps = len(STRIDES) - 1
+            raise ValueError(
+                f"{who}.taps must give {taps} maps, at 1/2 to 1/16, got {len(maps) - 1}"
+            )
+        for (name, channels), stride, found in zip(
+            self.channels._asdict().items(), STRIDES, maps, strict=True
+        ):
+            wanted = (channels, *(-(-side // stride) for side in image_size))
+            if found.shape[1:] != wanted:
+                shape = f"(C, H, W) {tuple(found.shape[1:])} instead of {wanted}"
+                raise ValueError(
+                    f"{who} gives the map {name} {shape}: see its channels and strides"
+                )
 
     def public_names(self) -> dict[str, str]:
         """The trunk has the names of the public checkpoint."""
