@@ -36,7 +36,12 @@ def at_least_single(tensor: Tensor) -> Tensor:
         >>> at_least_single(torch.ones(1, dtype=torch.float64)).dtype
         torch.float64
     """
-    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+    return in_dtype(tensor, torch.promote_types(tensor.dtype, torch.float32))
+
+
+def in_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """As :meth:`Tensor.to`, which leaves two nodes in a trace where nothing changes."""
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 
 def surely_below(tensor: Tensor, limit: float = torch.inf) -> bool:

@@ -24,7 +24,8 @@ def over_views(coefficients: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
 
     Values may come in parts, some of the V each.
     """
-    if torch.compiler.is_compiling():
+    # A program that is exported is not fused, but run as it stands.
+    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         # Joined they would be carried through memory.
         own = torch.split(coefficients, [part.shape[-2] for part in values], dim=-1)
         sums = [_FusedSums.apply(*pair) for pair in zip(own, values, strict=True)]  # type: ignore[no-untyped-call]

@@ -15,6 +15,7 @@ from torch.export import ExportedProgram
 from deltas_geom import PosedViews
 from deltas_geom.checks import check_depth_range
 from deltas_geom.numerics.arithmetic import outside_autocast
+from deltas_nets.network.conv_norm import with_affine_norms
 from deltas_nets.network.deltas import Deltas
 
 INPUTS = ("images", "K", "cam_from_world")
@@ -115,7 +116,7 @@ def trace(model: Deltas, config: ExportConfig) -> ExportedProgram:
     )
     # A region within the program that is exempt from autocast could not be loaded again.
     with outside_autocast(device.type), torch.no_grad():
-        return torch.export.export(FixedDeltas(model, config).eval(), inputs)
+        return torch.export.export(FixedDeltas(with_affine_norms(model), config).eval(), inputs)
 
 
 def without_paths(program: ExportedProgram) -> ExportedProgram:

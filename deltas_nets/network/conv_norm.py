@@ -4,11 +4,14 @@ A map of 96 channels is large, and a norm of its own reads and writes all of it;
 Gradients are those of the two, so that a network may be trained with frozen statistics as well.
 """
 
+import copy
+from typing import TypeVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from deltas_geom.numerics.arithmetic import at_least_single
+from deltas_geom.numerics.arithmetic import at_least_single, in_dtype
 
 
 def conv_norm(x: Tensor, conv: nn.Conv2d, norm: nn.Module) -> Tensor:
@@ -19,17 +22,60 @@ def conv_norm(x: Tensor, conv: nn.Conv2d, norm: nn.Module) -> Tensor:
         conv: without bias.
         norm: batch norm of the convolution's channels, shared between processes or not.
     """
-    if norm.training:
+    if norm.training and not isinstance(norm, Affine):
         normed: Tensor = norm(conv(x))
         return normed
+    assert conv.bias is None
+    slope, shift = (norm.slope, norm.shift) if isinstance(norm, Affine) else _affine(norm)
+    dtype = conv.weight.dtype
+    folded: Tensor = conv._conv_forward(
+        x, in_dtype(conv.weight * slope.view(-1, 1, 1, 1), dtype), in_dtype(shift, dtype)
+    )
+    return folded
+
+
+def _affine(norm: nn.Module) -> tuple[Tensor, Tensor]:
+    """What a norm whose statistics stand still multiplies each channel with, and then adds."""
     assert isinstance(norm, nn.BatchNorm2d | nn.SyncBatchNorm)
-    assert norm.running_mean is not None and norm.running_var is not None and conv.bias is None
+    assert norm.running_mean is not None and norm.running_var is not None
     variance, mean = at_least_single(norm.running_var), at_least_single(norm.running_mean)
     slope = norm.weight * torch.rsqrt(variance + norm.eps)
-    weight = (conv.weight * slope[:, None, None, None]).to(conv.weight.dtype)
-    shift = (norm.bias - mean * slope).to(conv.weight.dtype)
-    folded: Tensor = conv._conv_forward(x, weight, shift)
-    return folded
+    return slope, norm.bias - mean * slope
+
+
+class Affine(nn.Module):
+    """A batch norm of which nothing will change, as its factor and shift of each channel.
+
+    Args:
+        norm: in eval mode.
+    """
+
+    slope: Tensor
+    shift: Tensor
+
+    def __init__(self, norm: nn.BatchNorm2d) -> None:
+        super().__init__()
+        slope, shift = _affine(norm)
+        self.register_buffer("slope", slope.detach())
+        self.register_buffer("shift", shift.detach())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(B, C, H, W)``, as by the norm."""
+        slope, shift = (each.view(-1, 1, 1) for each in (self.slope, self.shift))
+        return in_dtype(x * slope + shift, x.dtype)
+
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def with_affine_norms(network: Network) -> Network:
+    """A copy whose norms will not change: a trace of it is a third shorter."""
+    network = copy.deepcopy(network)
+    for module in list(network.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, nn.BatchNorm2d):
+                setattr(module, name, Affine(child))
+    return network
 
 
 class SameConv(nn.Conv2d):

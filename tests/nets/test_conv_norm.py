@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from deltas_nets.network.conv_norm import SameConv, conv_norm
+from deltas_nets.network.conv_norm import Affine, SameConv, conv_norm, with_affine_norms
 from deltas_nets.network.layers import ConvBlock, WideRowConv
 
 
@@ -102,3 +102,17 @@ def test_rows_are_convolved_one_by_one() -> None:
     maps = torch.randn(2, 3, 4, 9, dtype=torch.float64)
     rows = [F.conv1d(maps[:, :, row], layer.weight, layer.bias, padding=2) for row in range(4)]
     assert_close(layer(maps), torch.stack(rows, dim=2))
+
+
+def test_a_copy_whose_norms_are_affine_gives_the_same() -> None:
+    conv, norm = conv_of(1, 1), trained_norm(8)
+    block = ConvBlock(4, 8).double().eval()
+    block[0], block[1] = conv, norm
+    x = torch.randn(2, 4, 7, 9, dtype=torch.float64)
+    copied = with_affine_norms(block)
+    assert_close(copied(x), block(x))
+    assert block[1] is norm and not any(isinstance(m, nn.BatchNorm2d) for m in copied.modules())
+    # Where no convolution is before it, and in half precision.
+    assert_close(Affine(norm)(x[:, :1].expand(-1, 8, -1, -1)), norm(x[:, :1].expand(-1, 8, -1, -1)))
+    half = trained_norm(8, dtype=torch.bfloat16)
+    assert Affine(half)(torch.ones(1, 8, 1, 1, dtype=torch.bfloat16)).dtype == torch.bfloat16
