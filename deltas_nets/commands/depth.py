@@ -1,6 +1,5 @@
 """The command `deltas depth`."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,13 +8,19 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from deltas_nets import __version__
-from deltas_nets.commands.depth_options import asked_options, fitting_options, look_first
+from deltas_nets.commands.depth_options import (
+    asked_options,
+    fitting_options,
+    look_first,
+    maps_at_once,
+)
 from deltas_nets.commands.depth_telling import show, tell
-from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for, usable_device
+from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
 from deltas_nets.commands.values import at_least_one, read_shard
 from deltas_nets.config import to_dict
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
@@ -102,6 +107,11 @@ class Depth(Captured, Measuring, Prediction):
     }  # fmt: skip
     checks: ClassVar = {"workers": at_least_one}
 
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.folder, "depth", "" if self.shard == "1/1" else self.shard)
+
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.captures.companions import companions
@@ -122,7 +132,7 @@ class Depth(Captured, Measuring, Prediction):
         capture = self.in_metres(capture, predictor, config)
         depth = None
         if self.views != 1 or not capture.metric:  # nothing is searched, and no unit to be found
-            depth = look_first(predictor, capture, config, self._at_once)
+            depth = look_first(predictor, capture, config, self.workers, self.device)
         few = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
             found = lone_frames(capture, self.view_sets, few)
@@ -215,19 +225,10 @@ class Depth(Captured, Measuring, Prediction):
 
     def _threads(self, maps: int) -> int:
         """Maps at once of those that are written."""
-        count = self._at_once(maps)
+        count = maps_at_once(maps, self.workers, self.device)
         if self.workers is None and count > 1:
             print(f"{count} maps at a time, a core each (--workers)")
         return count
-
-    def _at_once(self, maps: int) -> int:
-        """Maps at once: a core each, as cores that share a map wait for each other."""
-        from deltas_nets.predict.capture import FEWEST
-
-        if self.workers is not None or usable_device(self.device) != "cpu" or maps < FEWEST:
-            return self.workers or 1
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return min(cores or 1, maps)
 
     def _folder(
         self,

@@ -8,6 +8,7 @@ from typing import Any
 
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import LOCK
 from deltas_nets.outputs.atomic_files import (
     TEMPORARY,
     cannot_write,
@@ -157,7 +158,7 @@ def _summaries(out: Path, *, alone: bool = True) -> list[dict[str, Any]]:
     """
     # Listed before the summaries are read: what another shard has made by now has a summary.
     found = sorted(os.listdir(out)) if out.exists() else []
-    others = [name for name in found if not TEMPORARY.match(name)]
+    others = [name for name in found if not TEMPORARY.match(name) and not LOCK.fullmatch(name)]
     names = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
     earlier = [read for name in names if (read := read_summary(out / name)) is not None]
     if alone and others and not earlier:
