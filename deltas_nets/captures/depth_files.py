@@ -68,7 +68,8 @@ def _metres(steps: NDArray[np.int64], scale: float) -> NDArray[np.float32]:
 
 
 def _read_steps(stored: StoredDepth) -> NDArray[np.float32]:
-    image = decode(stored.path, stored.span, remedy="copy the file again")
+    remedy = "copy the file again"
+    image = decode(stored.path, stored.span, remedy=remedy, name="sensor depth")
     _check_steps(header_of(image), stored.path)
     return _metres(np.asarray(image).astype(np.int64), stored.scale)
 
@@ -107,7 +108,7 @@ def _bytes(stored: StoredDepth) -> bytes:
         with open_span(stored.path, stored.span) as file:
             return file.read()
     except OSError as error:
-        what = f"the depth cannot be read ({error.strerror or error})"
+        what = f"the sensor depth cannot be read ({error.strerror or error})"
         raise UserError(what, stored.path, "copy the file again") from error
 
 

@@ -101,8 +101,16 @@ def open_span(path: Path, span: Span | None = None) -> BinaryIO:
         return BytesIO(file.read(span.length))
 
 
-def decode(path: Path, span: Span | None = None, *, remedy: str) -> Image.Image:
+def decode(
+    path: Path, span: Span | None = None, *, remedy: str, name: str = "image"
+) -> Image.Image:
     """Decode every pixel, so that a file cut short is found here and not later.
+
+    Args:
+        path: the file.
+        span: which bytes of it; all if None.
+        remedy: what to do where it cannot be decoded.
+        name: what it is called then.
 
     Raises:
         UserError: the file is missing, or no image, or a damaged one.
@@ -112,9 +120,9 @@ def decode(path: Path, span: Span | None = None, *, remedy: str) -> Image.Image:
             image.load()
             return image
     except FileNotFoundError as error:
-        raise UserError("the image does not exist", path, remedy) from error
+        raise UserError(f"the {name} does not exist", path, remedy) from error
     except _UNREADABLE as error:
-        what = f"the image cannot be decoded ({why_not_decoded(path, error)})"
+        what = f"the {name} cannot be decoded ({why_not_decoded(path, error)})"
         raise UserError(what, path, remedy) from error
 
 
