@@ -25,6 +25,7 @@ __all__ = [
     "image_size_of",
     "in_words",
     "is_8_bit",
+    "mode_of",
     "open_span",
     "orientation_of",
     "resize_image",
@@ -181,6 +182,15 @@ def image_size_of(path: Path) -> tuple[int, int] | None:
     try:
         with Image.open(path) as image:
             return image.height, image.width
+    except _UNREADABLE:
+        return None
+
+
+def mode_of(path: Path) -> str | None:
+    """Pillow's word for the pixels of an image file, from its header; None if it is no image."""
+    try:
+        with Image.open(path) as image:
+            return image.mode
     except _UNREADABLE:
         return None
 
