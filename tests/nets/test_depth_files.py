@@ -18,6 +18,7 @@ from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.register import register_depth
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.depth_formats import read_depth_png
 
 FILE = Path("depth")
 MAPS = arrays.arrays(np.float16, arrays.array_shapes(min_dims=2, max_dims=2, max_side=40))
@@ -178,3 +179,11 @@ def test_an_npz_of_several_arrays_has_one_called_depth(tmp_path: Path) -> None:
     np.save(tmp_path / "c.npy", KNOWN > 0)
     with pytest.raises(UserError, match="yes and no"):
         depth_of(tmp_path / "c.npy")
+
+
+@pytest.mark.parametrize("scale", [1000.0, 5000.0, 256.0, 1234.567, 0.1])
+def test_every_step_is_read_to_the_last_bit(tmp_path: Path, scale: float) -> None:
+    steps = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
+    Image.fromarray(steps).save(tmp_path / "map.png")
+    wanted = (steps / np.float64(scale)).astype(np.float32)
+    assert (read_depth_png(tmp_path / "map.png", scale) == wanted).all()
