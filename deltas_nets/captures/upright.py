@@ -11,7 +11,14 @@ PITCH = 0.1
 """How much more level cameras are held from left to right than from front to back: a variance."""
 LEAST = 0.2
 """Length of the mean of the cameras' own ups, below which they say nothing: they look down, say."""
-Y_DOWN = np.diag([1.0, -1.0, -1.0])
+TURNS = np.array(
+    [
+        [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    ]
+)
+"""Rotations that turn x, y and z to y; the other way round all rows but that of their axis."""
 
 
 def up_of(capture: Capture) -> FloatArray:
@@ -31,13 +38,15 @@ def up_of(capture: Capture) -> FloatArray:
 def y_up_from_world(up: FloatArray) -> FloatArray:
     """``(3, 3)`` rotation that turns up to +y: glTF's axes.
 
-    Of a world whose y is down it is the half turn around x, and of others the one nearest to it.
+    The axis of the world that is nearest to up is turned there, about x if it can be, and then the
+    little that is left, on the shortest way: a camera that is held askew does not spin the world.
     """
-    towards = Y_DOWN @ (up / np.linalg.norm(up))
-    x, y, z = towards
-    if y < -1 + 1e-9:  # y is up already
-        return np.eye(3)
-    # The shortest rotation from one unit vector to another, here to y, by Rodrigues' formula.
+    up = up / np.linalg.norm(up)
+    axis = int(np.abs(up).argmax())
+    turn: FloatArray = np.sign(up[axis]) * TURNS[axis]
+    turn[2 if axis == 0 else 0] = np.abs(turn[2 if axis == 0 else 0])
+    x, y, z = turn @ up
+    # Rodrigues' formula; the angle is 55 degrees at most.
     cross = np.array([[0, -x, 0], [x, 0, z], [0, -z, 0]])
-    turned: FloatArray = (np.eye(3) + cross + cross @ cross / (1 + y)) @ Y_DOWN
-    return turned
+    left: FloatArray = np.eye(3) + cross + cross @ cross / (1 + y)
+    return left @ turn

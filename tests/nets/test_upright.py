@@ -72,7 +72,14 @@ def test_the_turn_is_a_rotation_that_takes_up_to_y(ups: FloatArray) -> None:
         ((0, -1, 0), [[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
         ((0, 1, 0), [[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
         ((0, 0, 1), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
+        ((0, 0, -1), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+        ((1, 0, 0), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+        ((-1, 0, 0), [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
     ],
 )
-def test_usual_worlds_are_turned_about_x(up: tuple[float, ...], turn: list[list[float]]) -> None:
+def test_usual_worlds_are_turned_by_quarters(
+    up: tuple[float, ...], turn: list[list[float]]
+) -> None:
     assert np.allclose(y_up_from_world(np.array(up)), turn, rtol=0, atol=1e-12)
+    askew = y_up_from_world(np.add(up, (0.02, -0.03, 0.01)))
+    assert np.allclose(askew, turn, rtol=0, atol=0.05)  # and not spun
