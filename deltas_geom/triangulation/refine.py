@@ -219,8 +219,7 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
 def _descend(problem: _Problem, steps: int) -> _End:
     points, fit = problem.start, _fit(problem, problem.start)
     error, cost, valid = fit.error, fit.cost, problem.sound & (fit.cost < torch.inf)
-    noise, moving = _rounding(problem, fit), valid
-    change, refused = points, torch.zeros_like(valid)
+    noise, moving, change, refused = _rounding(problem, fit), valid, points, ~valid
     for step in range(steps):
         by, determined = solve3_scaled(*_normal_equations(problem, fit))
         if step == 0:
