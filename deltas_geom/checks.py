@@ -2,6 +2,7 @@
 
 from collections.abc import Sized
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -171,9 +172,17 @@ def check_depth_range(depth_range: tuple[float, float]) -> None:
 
 
 def check_image_size(image_size: tuple[int, int]) -> None:
-    """Raise ``ValueError`` unless ``image_size`` is (height, width) of at least one pixel."""
+    """Raise unless ``image_size`` is (height, width) of at least one pixel.
+
+    Raises:
+        TypeError: they are floats, which would fail, or be rounded, far from here.
+        ValueError: all else.
+    """
     if not _is_pair(image_size) or min(image_size) < 1:
         raise ValueError(f"image_size must be (height, width) >= (1, 1), got {image_size}")
+    if any(isinstance(side, float | np.floating) for side in image_size):
+        cure = "use int(height), int(width)"
+        raise TypeError(f"image_size must hold whole numbers, got {image_size}: {cure}")
 
 
 def _is_pair(value: object) -> bool:

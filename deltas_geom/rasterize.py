@@ -53,7 +53,8 @@ def rasterize_depth(
 
     Raises:
         ShapeError: a trailing shape differs, or batch dims do not broadcast.
-        TypeError: the mask is not bool, or what should be real numbers are integers or no tensor.
+        TypeError: the mask is not bool, what should be real numbers are integers or no tensor, or
+            the size is in floats.
         ValueError: unknown reduce or splat, or an image without pixels.
 
     Source: the paper, section 3.3.
@@ -112,12 +113,18 @@ def _footprint(pixels: Tensor, splat: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _mean(index: Tensor, depth: Tensor, weight: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Weighted mean depth and summed weight of each pixel."""
+    """Weighted mean depth and summed weight of each pixel, which ends at the largest number."""
     empty = torch.zeros(*index.shape[:-1], size, dtype=depth.dtype, device=depth.device)
-    total = empty.scatter_add(-1, index, weight)
+    limits = torch.finfo(weight.dtype)
+    total = empty.scatter_add(-1, index, weight).clamp_max(limits.max)
+    # As parts of the pixel's largest, which cancels: sums of weights can overflow, and vanish.
+    most = empty.scatter_reduce(-1, index, weight.detach(), reduce="amax").gather(-1, index)
+    # Of subnormal weights gradients would be infinite.
+    changing = torch.where(most > limits.tiny, weight, weight.detach())
+    parts = changing / most.clamp_min(limits.tiny)
+    whole = empty.scatter_add(-1, index, parts).gather(-1, index)
     # Shares before the sum: weight times depth could overflow where the mean does not.
-    totals = total.gather(-1, index)
-    share = safe_divide(weight, totals, totals > torch.finfo(weight.dtype).tiny)
+    share = safe_divide(parts, whole, whole > 0)
     return empty.scatter_add(-1, index, share * depth), total
 
 

@@ -34,13 +34,34 @@ def warn(text: str) -> None:
 
 @contextlib.contextmanager
 def without_warnings_of_pillow() -> Iterator[None]:
-    """Pillow warns of large images and damaged ones with lines of its code.
+    """Pillow warns of large images and damaged ones with lines of its code, and libtiff by its own.
 
     Large ones are welcome, and of damaged ones our own line tells.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _silent_libtiff():
         warnings.filterwarnings("ignore", module=r"PIL\.")
         yield
+
+
+@contextlib.contextmanager
+def _silent_libtiff() -> Iterator[None]:
+    """libtiff prints what it thinks of a file past Python; where it can be found it does not."""
+    import ctypes
+
+    from PIL import _imaging
+
+    setters, before = [], []
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL(_imaging.__file__)  # which knows the libraries that it is linked to
+        setters = [library.TIFFSetErrorHandler, library.TIFFSetWarningHandler]
+    for setter in setters:
+        setter.argtypes, setter.restype = [ctypes.c_void_p], ctypes.c_void_p
+        before.append(setter(None))
+    try:
+        yield
+    finally:
+        for setter, handler in zip(setters, before, strict=True):
+            setter(handler)
 
 
 @contextlib.contextmanager

@@ -35,6 +35,7 @@ from deltas_geom.triangulation.robust_loss import Loss, robust_loss, second_deri
 _Loss = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _End = tuple[Vector3, Tensor, Tensor]  # points (*B, N) m, their _Fit.error, are they valid?
 _Descent = Callable[["_Problem", int], _End]
+_SHORTER = 0.25  # of a step that was refused
 _FARTHEST = 1e10  # px: a projection farther out than this is as good as behind the camera
 
 
@@ -71,9 +72,9 @@ def refine_points(
     r"""Move points so that their projections come closer to the pixels.
 
     Gauss-Newton on :math:`\sum_v w_v^2 \rho(\|e_v\|^2)`, e the distance in pixels. A robust loss
-    re-weights the views at each step (iteratively re-weighted least squares). A step is taken
-    only where this cost does not grow by more than rounding and the point stays in front of all
-    used views; elsewhere the point is kept.
+    re-weights the views at each step (iteratively re-weighted least squares). A step is taken only
+    where this cost grows by no more than rounding and the point stays in front of all used views;
+    elsewhere the point is kept, and the next step is a quarter of the refused one.
 
     Gradients: "unrolled" are those of the steps taken, however few; they also reach the
     ``points`` given, and cost as much as the steps. "implicit" are those of the optimum, by the
@@ -218,22 +219,24 @@ def _fit(problem: _Problem, points: Vector3) -> _Fit:
 def _descend(problem: _Problem, steps: int) -> _End:
     points, fit = problem.start, _fit(problem, problem.start)
     error, cost, valid = fit.error, fit.cost, problem.sound & (fit.cost < torch.inf)
-    noise, moving = _rounding(problem, fit), valid
+    noise, moving, change, refused = _rounding(problem, fit), valid, points, ~valid
     for step in range(steps):
-        change, determined = solve3_scaled(*_normal_equations(problem, fit))
+        by, determined = solve3_scaled(*_normal_equations(problem, fit))
         if step == 0:
             moving = valid = valid & determined
+        else:  # Of what was refused the fit is of another place: the same step, but shorter.
+            by = either(refused, tuple(_SHORTER * before for before in change), by)
+        change, moving = by, moving & (determined | refused)
         moved = tuple(x + by for x, by in zip(points, change, strict=True))
         x, y, z = (component.detach().abs() for component in moved)
-        moving = moving & determined & (x + y + z < problem.limit)
-        moved = either(moving, moved, points)
+        within = moving & (x + y + z < problem.limit)
+        moved = either(within, moved, points)
         fit = _fit(problem, moved)
         # Rounding must not refuse a step at the optimum, of which it carries the gradient.
         rounded = cost * (1 + 32 * torch.finfo(cost.dtype).eps) + noise
-        # What is refused once would be refused again: from there the fit does not matter.
-        moving = moving & (fit.cost < torch.add(rounded, safe_sqrt(cost * noise), alpha=2))
-        points = either(moving, moved, points)
-        error, cost = either(moving, (fit.error, fit.cost), (error, cost))
+        taken = within & (fit.cost < torch.add(rounded, safe_sqrt(cost * noise), alpha=2))
+        points, refused = either(taken, moved, points), moving & ~taken
+        error, cost = either(taken, (fit.error, fit.cost), (error, cost))
     return points, error, valid
 
 

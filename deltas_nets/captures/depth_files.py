@@ -8,20 +8,35 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deltas_nets.captures import float_files
 from deltas_nets.captures.exr import read_exr
-from deltas_nets.captures.float_files import read_npy, read_pfm
-from deltas_nets.captures.images import Header, Span, decode, header_of, header_of_whole_file
+from deltas_nets.captures.float_files import read_npy, read_pfm, unzipped
+from deltas_nets.captures.images import (
+    Header,
+    Span,
+    decode,
+    header_of,
+    header_of_whole_file,
+    mode_of,
+)
 from deltas_nets.captures.images import open_span as open_span
 from deltas_nets.errors import UserError
 
-__all__ = ["DEPTH_FORMATS", "FLOATS", "MILLIMETRES", "DepthFormat", "StoredDepth", "depth_format"]
+__all__ = [
+    "DEPTH_FORMATS",
+    "MILLIMETRES",
+    "DepthFormat",
+    "StoredDepth",
+    "depth_format",
+    "holds_floats",
+]
 
 MILLIMETRES = 1000.0
 """Steps in a metre."""
 UNKNOWN_DEPTH = 65535
 """7-Scenes and some headsets write this for "no depth", beside 0."""
-FLOATS = (".npy", ".pfm", ".exr")
-"""Suffixes of files of floats."""
+_ALWAYS_FLOATS, _ARRAYS, _TIFF = (".pfm", ".exr"), (".npy", ".npz"), (".tif", ".tiff")
+"""Suffixes of files of floats, and of those that hold them or whole numbers."""
 FILE_LIMIT = 2**30
 """Bytes of a file of floats."""
 
@@ -62,15 +77,52 @@ def depth_format(path: Path) -> DepthFormat:
     return DEPTH_FORMATS.get(path.suffix.lower(), _STEPS)
 
 
-def _metres(steps: NDArray[np.int64], scale: float) -> NDArray[np.float32]:
-    unknown = (steps <= 0) | (steps >= UNKNOWN_DEPTH)
+def holds_floats(path: Path) -> bool:
+    """Whether a file of depth holds floats, in a unit, and not whole numbers, which are steps.
+
+    Of formats that can hold either the file is looked into; one that cannot be read holds none.
+    """
+    suffix = path.suffix.lower()
+    if suffix in _ALWAYS_FLOATS:
+        return True
+    if suffix in _ARRAYS:
+        return float_files.holds_floats(path)
+    return suffix in _TIFF and mode_of(path) == "F"
+
+
+def _metres(steps: NDArray[np.integer], scale: float) -> NDArray[np.float32]:
+    unknown = (steps <= 0) | (steps == UNKNOWN_DEPTH)
     return np.where(unknown, 0.0, steps / scale).astype(np.float32)
 
 
-def _read_steps(stored: StoredDepth) -> NDArray[np.float32]:
-    image = decode(stored.path, stored.span, remedy="copy the file again")
+def _in_unit(depth: NDArray[np.float32], unit: float) -> NDArray[np.float32]:
+    known = np.isfinite(depth) & (depth > 0)
+    return np.where(known, depth, np.float32(0)) * np.float32(unit)
+
+
+def _read_image(stored: StoredDepth) -> NDArray[np.float32]:
+    """Whole numbers are steps; floats, which a TIFF may hold, are in the unit."""
+    remedy = "copy the file again"
+    image = decode(stored.path, stored.span, remedy=remedy, name="sensor depth")
+    if image.mode == "F":
+        return _in_unit(np.asarray(image, dtype=np.float32), stored.unit)
     _check_steps(header_of(image), stored.path)
-    return _metres(np.asarray(image).astype(np.int64), stored.scale)
+    return _metres(np.asarray(image), stored.scale)
+
+
+def _read_array(stored: StoredDepth) -> NDArray[np.float32] | NDArray[np.integer]:
+    data = _bytes(stored)
+    if stored.path.suffix.lower() == ".npz":
+        data = unzipped(data, stored.path, FILE_LIMIT)
+    return read_npy(data, stored.path)
+
+
+def _read_numbers(stored: StoredDepth) -> NDArray[np.float32]:
+    """Whole numbers are steps, as in an image; floats are in the unit."""
+    array = _read_array(stored)
+    if array.dtype == np.float32:
+        return _in_unit(array, stored.unit)  # type: ignore[arg-type]
+    return _metres(array, stored.scale)  # type: ignore[arg-type]
 
 
 def _size_of_steps(stored: StoredDepth) -> tuple[int, int] | None:
@@ -91,9 +143,7 @@ def _floats(
     read: Callable[[bytes, Path], NDArray[np.float32]],
 ) -> Callable[[StoredDepth], NDArray[np.float32]]:
     def read_file(stored: StoredDepth) -> NDArray[np.float32]:
-        depth = read(_bytes(stored), stored.path)
-        known = np.isfinite(depth) & (depth > 0)
-        return np.where(known, depth, np.float32(0)) * np.float32(stored.unit)
+        return _in_unit(read(_bytes(stored), stored.path), stored.unit)
 
     return read_file
 
@@ -107,7 +157,7 @@ def _bytes(stored: StoredDepth) -> bytes:
         with open_span(stored.path, stored.span) as file:
             return file.read()
     except OSError as error:
-        what = f"the depth cannot be read ({error.strerror or error})"
+        what = f"the sensor depth cannot be read ({error.strerror or error})"
         raise UserError(what, stored.path, "copy the file again") from error
 
 
@@ -130,21 +180,22 @@ def _read_packed_steps(stored: StoredDepth) -> NDArray[np.float32]:
             raise damaged from error
     if len(data) != due:
         raise damaged
-    return _metres(np.frombuffer(data, "<u2").reshape(stored.size).astype(np.int64), stored.scale)
+    return _metres(np.frombuffer(data, "<u2").reshape(stored.size), stored.scale)
 
 
 def _only_reading_tells(stored: StoredDepth) -> None:
     return None
 
 
-_STEPS = DepthFormat(_read_steps, _size_of_steps)
+_STEPS = DepthFormat(_read_image, _size_of_steps)
 
 DEPTH_FORMATS = {
     ".png": _STEPS,
     ".exr": DepthFormat(_floats(read_exr), _only_reading_tells),
     ".pfm": DepthFormat(_floats(read_pfm), _only_reading_tells),
-    ".npy": DepthFormat(_floats(read_npy), _only_reading_tells),
+    ".npy": DepthFormat(_read_numbers, _only_reading_tells),
+    ".npz": DepthFormat(_read_numbers, _only_reading_tells),
     ".sens": DepthFormat(_read_packed_steps, _only_reading_tells),
 }
-"""By suffix. What is not here is read as an image of whole numbers. Files of floats hold metres, or
-the capture's unit."""
+"""By suffix. What is not here is read as an image of whole numbers, or a TIFF of floats. Whole
+numbers of any file are steps; floats are metres, or in the capture's unit."""

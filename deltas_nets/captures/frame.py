@@ -139,7 +139,8 @@ class Frame:
     def _decode_image(self) -> NDArray[np.uint8]:
         image = decode(self.image_path, self.image_span, remedy=_COPY_AGAIN)
         self._check_image(header_of(image))
-        pixels = np.asarray(image.convert("RGB"))
+        # Of what is RGB already convert would make a copy.
+        pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
         pixels.setflags(write=False)
         return pixels
 

@@ -25,6 +25,7 @@ __all__ = [
     "image_size_of",
     "in_words",
     "is_8_bit",
+    "mode_of",
     "open_span",
     "orientation_of",
     "resize_image",
@@ -101,8 +102,16 @@ def open_span(path: Path, span: Span | None = None) -> BinaryIO:
         return BytesIO(file.read(span.length))
 
 
-def decode(path: Path, span: Span | None = None, *, remedy: str) -> Image.Image:
+def decode(
+    path: Path, span: Span | None = None, *, remedy: str, name: str = "image"
+) -> Image.Image:
     """Decode every pixel, so that a file cut short is found here and not later.
+
+    Args:
+        path: the file.
+        span: which bytes of it; all if None.
+        remedy: what to do where it cannot be decoded.
+        name: what it is called then.
 
     Raises:
         UserError: the file is missing, or no image, or a damaged one.
@@ -112,9 +121,9 @@ def decode(path: Path, span: Span | None = None, *, remedy: str) -> Image.Image:
             image.load()
             return image
     except FileNotFoundError as error:
-        raise UserError("the image does not exist", path, remedy) from error
+        raise UserError(f"the {name} does not exist", path, remedy) from error
     except _UNREADABLE as error:
-        what = f"the image cannot be decoded ({why_not_decoded(path, error)})"
+        what = f"the {name} cannot be decoded ({why_not_decoded(path, error)})"
         raise UserError(what, path, remedy) from error
 
 
@@ -173,6 +182,15 @@ def image_size_of(path: Path) -> tuple[int, int] | None:
     try:
         with Image.open(path) as image:
             return image.height, image.width
+    except _UNREADABLE:
+        return None
+
+
+def mode_of(path: Path) -> str | None:
+    """Pillow's word for the pixels of an image file, from its header; None if it is no image."""
+    try:
+        with Image.open(path) as image:
+            return image.mode
     except _UNREADABLE:
         return None
 

@@ -39,6 +39,8 @@ class Fault(Enum):
     OPENCV_AXES = "poses have OpenCV's axes (y down, z forward), the format has OpenGL's"
     OTHER_AXES = "poses have other axes than x right, y down, z forward"
     OTHER_AXES_THAN_OPENGL = "poses have other axes than x right, y up, z backward"
+    IMAGES_TURNED = "images are turned, and their K and poses are not"
+    IMAGES_TURNED_BESIDE_POSES = "images are turned, and their poses are not"
     POSES_MIRROR = "poses mirror, as no camera moves"
     POSES_SCALE = "the rotations of poses hold a scale"
     POSES_TRANSPOSED = "poses are transposed"

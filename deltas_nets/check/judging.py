@@ -24,6 +24,7 @@ from deltas_nets.check.scale import wrong_scale
 from deltas_nets.check.sensor import sensors
 from deltas_nets.check.time_shift import poses_of_other_frames
 from deltas_nets.check.trying import ENOUGH, Case
+from deltas_nets.check.turned import turned_images, turned_images_of_right_K
 from deltas_nets.check.whole import diagnosed, of_all_cameras
 
 __all__ = ["Figures", "judge_matches"]
@@ -118,16 +119,16 @@ def _explained(case: Case) -> list[Finding]:
     ]
     if diagnosis.cause is Cause.NO_BASELINE:
         return [_no_baseline(diagnosis)]
+    if not suspects and level(given) > ENOUGH:
+        axes = other_axes(case)
+        others = [] if axes is None else [axes]
+        suspects = [*turned_images_of_right_K(case), *others, *turned_images(case)]
     if suspects:
         best = min(suspects, key=lambda suspect: suspect.tried.after)
         # Of those that are about as good, the simplest: they come in that order.
         return [
             next(s for s in suspects if s.tried.after <= 1.25 * best.tried.after + 0.05).finding
         ]
-    if level(given) > ENOUGH:
-        otherwise = other_axes(case)
-        if otherwise is not None:
-            return [otherwise.finding]
     strict = residuals(evidence, *matched.views(capture.frames), share=MOSTLY)
     apart = views_apart(evidence, strict, len(matched.positions))
     if apart:

@@ -11,7 +11,7 @@ from deltas_geom import PosedViews, triangulate
 from deltas_geom.cameras.poses import camera_centers
 from deltas_geom.diagnosis.evidence import Evidence
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.depth_files import FLOATS
+from deltas_nets.captures.depth_files import holds_floats
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.matched import Matched
@@ -116,7 +116,7 @@ def _read(sensor: Sensor, pixels: FloatArray, size: tuple[int, int]) -> FloatArr
 def _holds_floats(capture: Capture, known: Mapping[int, Sensor]) -> bool:
     """Whether depth is stored as floats, of which no number of steps that is stated counts."""
     files = [capture.frames.at(position).depth_path for position in known]
-    return any(file is not None and file.suffix.lower() in FLOATS for file in files)
+    return any(file is not None and holds_floats(file) for file in files)
 
 
 def _of_no_factor(ratios: FloatArray) -> Finding:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from deltas_nets.commands.series import MeasuredSeries
+from deltas_nets.outputs.alone import Written
 
 Table = Literal[
     "points", "ratio", "nms", "threshold", "samples", "offsets", "architecture", "sparse"
@@ -34,6 +35,11 @@ class Ablate(MeasuredSeries):
         kw_only=True
     )
     """Folder with images, poses, intrinsics and depth/N.png."""
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.out, "series", self.table)
 
     def run(self) -> None:
         """Run the command."""

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
+from deltas_nets.outputs.alone import Written
+
 __all__ = ["Command"]
 
 
@@ -24,6 +26,11 @@ class Command:
     def going_on(self) -> str:
         """What to do after the command was stopped."""
         return "start it again"
+
+    @property
+    def written(self) -> Written | None:
+        """What no other run may write meanwhile."""
+        return None
 
     @classmethod
     def parsed_as(cls, arguments: Sequence[str]) -> Any:

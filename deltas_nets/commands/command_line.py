@@ -17,6 +17,7 @@ from deltas_nets.commands.memory import lacking_memory
 from deltas_nets.commands.values import check_values
 from deltas_nets.commands.words import first_page, sentence
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import alone
 from deltas_nets.terminal import (
     silent_without_reader,
     stopped_like_ctrl_c,
@@ -40,7 +41,7 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
         command = parse(list(arguments), commands)
         try:
             check_values(command)
-            with stopped_like_ctrl_c(), without_warnings_of_pillow():
+            with stopped_like_ctrl_c(), without_warnings_of_pillow(), alone(command.written):
                 command.run()
         except UserError as error:
             if command.debug:

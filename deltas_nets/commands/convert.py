@@ -86,7 +86,7 @@ class Convert(Command):
             source.check()
             if isinstance(source, Predicted) and source.missing:
                 warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
-            capture = with_maps(source.capture, self.depths, wanted=holds_depth)
+            capture = with_maps(source.capture, self.depths)
             with progress("points", len(source.ids)) as report:
                 found = seeds(source, self.points or POINTS, report=report)
             capture = replace(capture, points=found)

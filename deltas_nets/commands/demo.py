@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deltas_nets.commands.flags import Flag, Prediction
+from deltas_nets.outputs.alone import Written
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,11 @@ class Demo(Prediction):
     """Folder to write to."""
     overwrite: Flag = False
     """Write into a folder that holds other things."""
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.out, "depth")
 
     def run(self) -> None:
         """Run the command."""

@@ -1,6 +1,5 @@
 """The command `deltas depth`."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,22 +7,25 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from deltas_nets import __version__
-from deltas_nets.commands.depth_options import asked_options, fitting_options, look_first
+from deltas_nets.commands.depth_folder import asked_settings, check_settings, prepare_folder
+from deltas_nets.commands.depth_options import (
+    asked_options,
+    fitting_options,
+    look_first,
+    maps_at_once,
+)
 from deltas_nets.commands.depth_telling import show, tell
-from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for, usable_device
+from deltas_nets.commands.flags import Captured, Flag, Prediction, folder_for
 from deltas_nets.commands.fuse import fuse_maps
 from deltas_nets.commands.measuring import Measuring
 from deltas_nets.commands.values import at_least_one, read_shard
-from deltas_nets.config import to_dict
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress, warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
-    from deltas_nets.captures.usable import UsableViews
+    from deltas_nets.captures.measured import Measured
     from deltas_nets.captures.view_sets import ViewSet
-    from deltas_nets.outputs.folder import OutputFolder
-    from deltas_nets.outputs.products import OutputOptions
     from deltas_nets.predict.depth_map import PredictConfig
     from deltas_nets.predict.predictor import Predictor
     from deltas_nets.predict.search import Search
@@ -102,6 +104,11 @@ class Depth(Captured, Measuring, Prediction):
     }  # fmt: skip
     checks: ClassVar = {"workers": at_least_one}
 
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.folder, "depth", "" if self.shard == "1/1" else self.shard)
+
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.captures.companions import companions
@@ -117,12 +124,15 @@ class Depth(Captured, Measuring, Prediction):
         capture = self.opened(self.capture).remembering()
         check_place(self.folder, overwrite=self.overwrite, forbidden=capture.path)
         predictor = self.predictor()
-        if self.sensor_depth is not None:
-            predictor.check_measured()
+        self.check_measuring(predictor, capture)
         capture = self.in_metres(capture, predictor, config)
+        measured = self.measured(capture)
+        # What an earlier run had otherwise is told before any look, as far as it is known by now.
+        asked = asked_settings(self, capture, predictor, config)
+        check_settings(self.folder, asked, capture.scaled_by, overwrite=self.overwrite)
         depth = None
         if self.views != 1 or not capture.metric:  # nothing is searched, and no unit to be found
-            depth = look_first(predictor, capture, config, self._at_once)
+            depth = look_first(predictor, capture, config, self.workers, self.device)
         few = keyframes(capture, working_depth=depth) if self.keyframes else None
         if self.views == 1:
             found = lone_frames(capture, self.view_sets, few)
@@ -143,13 +153,13 @@ class Depth(Captured, Measuring, Prediction):
         anchors = [views.anchor for views in found.view_sets]
         heard = (
             companions(capture, mine, working_depth=depth, elsewhere=anchors)
-            if self._passes > 1
+            if self.passes_made > 1
             else ()
         )
-        search = self._search(capture, depth, [views.anchor for views in mine])
+        search = self._search(capture, measured, depth, [views.anchor for views in mine])
         threads = self._threads(len(mine))
         config = self._sized(config, predictor, capture, found.view_sets, search, threads)
-        folder = self._folder(capture, found, shard, options, predictor, config)
+        folder = prepare_folder(self, capture, found, shard, options, predictor, config)
         outcome = predict_capture(
             predictor,
             capture,
@@ -159,7 +169,7 @@ class Depth(Captured, Measuring, Prediction):
             heard=heard,
             search=search,
             short=found.short,
-            passes=self._passes,
+            passes=self.passes_made,
             threads=threads,
             progress=progress,
         )
@@ -170,10 +180,15 @@ class Depth(Captured, Measuring, Prediction):
         if self.page:
             show(capture, self.folder, self.range)
 
-    def _search(self, capture: "Capture", depth: float | None, anchors: list[str]) -> "Search":
+    def _search(
+        self,
+        capture: "Capture",
+        measured: "Measured | None",
+        depth: float | None,
+        anchors: list[str],
+    ) -> "Search":
         from deltas_nets.predict.search import Asked, Completed, Followed
 
-        measured = self.measured(capture)
         self.check_whole(capture, anchors)
         if self.views == 1:
             assert measured is not None  # or the flag would have been refused
@@ -215,72 +230,10 @@ class Depth(Captured, Measuring, Prediction):
 
     def _threads(self, maps: int) -> int:
         """Maps at once of those that are written."""
-        count = self._at_once(maps)
+        count = maps_at_once(maps, self.workers, self.device)
         if self.workers is None and count > 1:
             print(f"{count} maps at a time, a core each (--workers)")
         return count
-
-    def _at_once(self, maps: int) -> int:
-        """Maps at once: a core each, as cores that share a map wait for each other."""
-        from deltas_nets.predict.capture import FEWEST
-
-        if self.workers is not None or usable_device(self.device) != "cpu" or maps < FEWEST:
-            return self.workers or 1
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return min(cores or 1, maps)
-
-    def _folder(
-        self,
-        capture: "Capture",
-        views: "UsableViews",
-        shard: tuple[int, int],
-        options: "OutputOptions",
-        predictor: "Predictor",
-        config: "PredictConfig",
-    ) -> "OutputFolder":
-        import torch
-
-        from deltas_nets.captures.camera_sums import camera_sums
-        from deltas_nets.captures.ids import id_in_json
-        from deltas_nets.outputs.depth_formats import MILLIMETRES
-        from deltas_nets.outputs.prepare import prepare_output
-        from deltas_nets.outputs.summary import CAMERA_SUMS, FORMAT, SCALE, view_sets_in_json
-
-        predict = to_dict(config)
-        if self.depth_range is None:
-            predict["depth_range"] = "as the capture suggests, frame by frame"
-        unusual = {SCALE: (options.depth_scale, MILLIMETRES), FORMAT: (options.depth_format, "png")}
-        mine = views.view_sets[shard[0] - 1 :: shard[1]]
-        return prepare_output(
-            self.folder,
-            settings={
-                "predict": predict,
-                "network": predictor.network_record(),
-                "weights": predictor.weights_record(self.weights),
-                "capture": {"path": capture.path.resolve(), "cameras": capture.fingerprint()},
-                "precision": self.precision,
-                "views": self.views,
-                "view_sets": view_sets_in_json(views.view_sets),
-                "passes": self._passes,
-                **self.measured_record(),
-                **{name: value for name, (value, usual) in unusual.items() if value != usual},
-            },
-            overwrite=self.overwrite,
-            forbidden=capture.path,
-            shard=shard,
-            frame_ids=[views.anchor for views in mine],
-            options=options,
-            head={
-                "versions": {"deltas-depth": __version__, "torch": torch.__version__},
-                "layout": capture.layout,
-                "unit": options.unit,
-                "scaled_by": capture.scaled_by,
-                "depth_scaled_by": capture.depth_scaled_by,
-                CAMERA_SUMS: camera_sums(capture.frames),
-                "lost_poses": list(map(id_in_json, capture.lost)),
-                "sets_short_of_views": views.short,
-            },
-        )
 
     @property
     def going_on(self) -> str:
@@ -289,7 +242,7 @@ class Depth(Captured, Measuring, Prediction):
         return f"the same command goes on{without}"
 
     @property
-    def _passes(self) -> int:
+    def passes_made(self) -> int:
         """Maps that rest on one image alone hear no others."""
         return 1 if self.views == 1 else self.passes
 

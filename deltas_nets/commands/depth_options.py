@@ -1,10 +1,10 @@
 """What `deltas depth` knows before it starts: how far surfaces are, in which steps it writes."""
 
-from collections.abc import Callable
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
-from deltas_nets.commands.flags import sensible
+from deltas_nets.commands.flags import sensible, usable_device
 from deltas_nets.errors import UserError
 from deltas_nets.terminal import progress
 
@@ -71,7 +71,8 @@ def look_first(
     predictor: "Predictor",
     capture: "Capture",
     config: "PredictConfig",
-    at_once: Callable[[int], int],
+    workers: int | None,
+    device: str,
 ) -> float | None:
     """How far surfaces are, by a few maps; None where the capture says so or is of a usual room.
 
@@ -79,7 +80,8 @@ def look_first(
         predictor: of a trained network.
         capture: the frames.
         config: all but the range.
-        at_once: of how many maps so many are computed at once.
+        workers: maps computed at once, if that was said.
+        device: where.
     """
     from deltas_nets.captures.working_depth import knows_its_scale
     from deltas_nets.predict.first_look import (
@@ -91,7 +93,17 @@ def look_first(
 
     if knows_its_scale(capture):  # no bar for what takes no time
         return None
-    threads = at_once(ANCHORS)
+    threads = maps_at_once(ANCHORS, workers, device)
     looks = ANCHORS + (ENOUGH_FOR_ROOMS if capture.metric else 0)
     with progress("first look", ROUNDS * looks) as report:
         return depth_unlike_rooms(predictor, capture, config, threads=threads, report=report)
+
+
+def maps_at_once(maps: int, workers: int | None, device: str) -> int:
+    """Maps computed at once: a core each, as cores that share a map wait for each other."""
+    from deltas_nets.predict.capture import FEWEST
+
+    if workers is not None or usable_device(device) != "cpu" or maps < FEWEST:
+        return workers or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(cores or 1, maps)

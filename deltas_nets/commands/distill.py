@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.config.distill import DistillConfig
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress
 
 
@@ -26,6 +27,11 @@ class Distill(DistillConfig, Command):
     """Replace --out if it exists."""
     debug: Flag = False
     """Show the traceback of an error."""
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.out.parent, "weights", self.out.name)
 
     def run(self) -> None:
         """Run the command."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from deltas_nets.commands.evaluate_flags import warn_of, warn_of_unit, without_effect
+from deltas_nets.commands.evaluate_flags import warn_of, warn_of_maps, without_effect
 from deltas_nets.commands.flags import Flag, Prediction, usable_device
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
@@ -99,7 +99,7 @@ class Evaluate(Prediction):
         self._write(scores)  # before the reader of what is printed may have had enough
         self._print(scores, title)
         if self.predictions is not None:
-            warn_of_unit(scores.total)
+            warn_of_maps(scores.total)
         if scores.failures:
             failed = {**scores.total.failed, **scores.failed}
             said = f"frames and scenes that failed: {scores.failures}; the first, "

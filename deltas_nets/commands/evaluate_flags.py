@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deltas_nets.terminal import warn
+from deltas_nets.terminal import counted, warn
 
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
     from deltas_nets.evaluate.scores import CaptureScores
 
-__all__ = ["warn_of", "warn_of_unit", "without_effect"]
+__all__ = ["warn_of", "warn_of_maps", "without_effect"]
 
 FEW = 0.2
 """Share of pixels that are right, or wrong, within a factor of nearly two."""
@@ -33,11 +33,17 @@ def warn_of(name: str, capture: "Capture", maps: Path | None) -> None:
         warn("the maps were made with the sensor depth that they are scored against")
 
 
-def warn_of_unit(scores: "CaptureScores") -> None:
-    """Warn where maps of any program are right but for a factor, as of another unit.
+def warn_of_maps(scores: "CaptureScores") -> None:
+    """Warn where maps of any program are empty, or right but for a factor, as of another unit.
 
     Poses whose scale is off by some per cent do not count.
     """
+    empty = [id for id, each in scores.maps.items() if not each.sums.used]
+    if empty:
+        warn(
+            f"{len(empty)} of {counted(len(scores.maps), 'map')} have no depth where the true "
+            f"depth is, and count in the coverage alone; the first is {empty[0]}"
+        )
     as_they_are, scaled = scores.dense, scores.median_scaled
     if as_they_are.delta3 < FEW and scaled.delta3 > 1 - FEW:
         warn("the maps are right but for a factor: are they in metres, and PNG in millimetres?")

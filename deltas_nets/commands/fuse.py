@@ -11,6 +11,7 @@ from deltas_nets.commands.depth_telling import show_fused
 from deltas_nets.commands.flags import Flag, folder_for, opened, sensible, usable_device
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import counted, progress, warn
 
 if TYPE_CHECKING:
@@ -75,11 +76,16 @@ class Fuse(Command):
 
     going_on = "the same command goes on"
 
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self._out, "fuse")
+
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.captures.scaled import in_metres
 
-        out = self.out or folder_for(self.capture, "fused")
+        out = self._out
         if out.resolve() == self.capture.resolve():
             what = "the output folder is the capture itself"
             raise UserError(what, out, "name another folder with --out")
@@ -93,6 +99,10 @@ class Fuse(Command):
             capture = in_metres(capture, self.scale)
         self.fuse(capture, out)
         show_fused(capture, self.depths, out)
+
+    @property
+    def _out(self) -> Path:
+        return self.out or folder_for(self.capture, "fused")
 
     @property
     def _of_sensor(self) -> bool:

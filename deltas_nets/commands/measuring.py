@@ -12,7 +12,10 @@ from deltas_nets.terminal import warn
 if TYPE_CHECKING:
     from deltas_nets.captures.capture import Capture
     from deltas_nets.captures.measured import Measured
+    from deltas_nets.predict.predictor import Predictor
 
+MEASURED = "sensor_depth"
+"""The setting of a run that is there where measured depth is."""
 SENSOR, POINTS, HAND = 0.01, 0.02, 0.01
 """Standard deviations as shares of the depth, where the user states none."""
 
@@ -66,6 +69,19 @@ class Measuring:
             warn(f"{doubt} ({self.sensor_depth})")
         return ByHand(capture, rows, deviation or HAND)
 
+    def check_measuring(self, predictor: "Predictor", capture: "Capture") -> None:
+        """Whether the network hears measured depth, and a file of it is right, before any look.
+
+        Raises:
+            UserError: one is not so.
+        """
+        from deltas_nets.captures.measured import measured_by_hand
+
+        if self.sensor_depth is not None:
+            predictor.check_measured()
+            if str(self.sensor_depth) not in ("sensor", "points"):
+                measured_by_hand(self.sensor_depth, capture)
+
     def check_completes(self, measured: "Measured", capture: "Capture", anchors: list[str]) -> None:
         """Whether something is measured of all frames that are to be completed.
 
@@ -100,4 +116,4 @@ class Measuring:
         file = self.sensor_depth if self.sensor_depth.is_file() else None
         content = {} if file is None else {"lines": file.read_text("utf-8").splitlines()}
         given = {"from": str(self.sensor_depth), "deviation": self.sensor_deviation}
-        return {"sensor_depth": given | content}
+        return {MEASURED: given | content}

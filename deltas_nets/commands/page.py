@@ -8,6 +8,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, opened
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress
 
 
@@ -38,6 +39,11 @@ class Page(Command):
     """As they were given to deltas depth, if they were."""
     debug: Flag = False
     """Show the traceback of an error."""
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.depths, "page")
 
     def run(self) -> None:
         """Run the command."""

@@ -13,6 +13,7 @@ from deltas_nets.commands.flags import Flag
 from deltas_nets.commands.train import encoder_file
 from deltas_nets.config.recipes import RECIPES, RecipeName
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress
 
 
@@ -47,6 +48,11 @@ class Recipe(Command):
     """Show the traceback of an error."""
 
     going_on = "the same command goes on"
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.out, "train")
 
     def run(self) -> None:
         """Run the command."""

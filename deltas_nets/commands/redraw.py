@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.config.redraw import RedrawConfig
+from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress
 
 
@@ -25,6 +26,11 @@ class Redraw(RedrawConfig, Command):
     """Replace --out and --log if they exist."""
     debug: Flag = False
     """Show the traceback of an error."""
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.out.parent, "weights", self.out.name)
 
     def run(self) -> None:
         """Run the command."""

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from deltas_nets.commands.series import MeasuredSeries
+from deltas_nets.outputs.alone import Written
 
 Curve = Literal[
     "translation",
@@ -41,6 +42,11 @@ class Robustness(MeasuredSeries):
         kw_only=True
     )
     """Folder with images, poses, intrinsics and depth/N.png."""
+
+    @property
+    def written(self) -> Written:
+        """What no other run may write meanwhile."""
+        return Written(self.out, "series", self.curve)
 
     def run(self) -> None:
         """Run the command."""

@@ -15,6 +15,7 @@ from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import TRAIN_CONFIGS, TrainConfig
 from deltas_nets.config.encoders import ENCODERS
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import Written
 
 Preset = Literal[Network, "cost-volume"]
 PRESETS: tuple[Preset, ...] = (*NETWORKS, "cost-volume")
@@ -84,6 +85,11 @@ class Train(Command):
             default = replace(default, config=config, preset=preset_like(config))
         return Annotated[cls, tyro.conf.subcommand(name="train", default=default)]
 
+    @property
+    def written(self) -> Written | None:
+        """What no other run may write meanwhile."""
+        return Written(self.out, "train") if first_process() else None
+
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.outputs.atomic_files import check_writable
@@ -129,7 +135,7 @@ class Train(Command):
             checkpoint_every=self.checkpoint_every,
             validate_every=self.validate_every,
         )
-        if os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0":
+        if first_process():
             print(f"weights in {weights}")
 
     def _check_counts(self) -> None:
@@ -138,6 +144,15 @@ class Train(Command):
             if value < least:
                 option = f"--{name.replace('_', '-')} {value}"
                 raise UserError("too few steps", option, f"give {least} or more")
+
+
+def first_process() -> bool:
+    """Whether this is the process that writes, where several train together."""
+    if "RANK" in os.environ:
+        return os.environ["RANK"] == "0"
+    # Those of one machine that Fabric starts, machines that are told their number, and Slurm's.
+    names = ("LOCAL_RANK", "NODE_RANK", "SLURM_PROCID")
+    return all(os.environ.get(name, "0") == "0" for name in names)
 
 
 def preset_of(arguments: Sequence[str]) -> Preset:

@@ -24,6 +24,7 @@ from deltas_nets.predict.depth_map import KeypointDepths, PredictConfig, frames_
 from deltas_nets.predict.look import look
 from deltas_nets.predict.predictor import Predictor
 from deltas_nets.predict.reach import Reach
+from deltas_nets.terminal import counted
 
 Map = NDArray[np.float32]
 
@@ -123,7 +124,7 @@ def evaluate_files(
         report: called with the id of every finished frame.
 
     Raises:
-        UserError: all frames fail, or no anchor has true depth in range.
+        UserError: all frames fail, no anchor has true depth in range, or no map depth there.
     """
     scale = recorded_depth_scale(predictions)
     ours = read_summary(predictions / SUMMARY) is not None
@@ -134,7 +135,13 @@ def evaluate_files(
         _check_upright(depth, capture.frame(views.anchor), predictions)
         return _Scored(depth, None, None)
 
-    return _evaluate(read, capture, view_sets, scoring or Scoring(), None, report)
+    scores = _evaluate(read, capture, view_sets, scoring or Scoring(), None, report)
+    if not any(each.sums.used for each in scores.maps.values()):
+        what = "no map has depth where the true depth is, of " + counted(len(scores.maps), "map")
+        again = "run deltas depth again, with a lower --min-confidence"
+        remedy = again if ours else "write depth along z, where 0 and NaN are none"
+        raise UserError(what, predictions / "depth", remedy)
+    return scores
 
 
 def _check_upright(depth: Map, frame: Frame, folder: Path) -> None:

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ply_vertices import header_of, vertices_of
+from deltas_nets.captures.upright import y_up_from_world
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.cloud import CloudPoints
 from deltas_nets.fuse.mesh import Mesh
@@ -15,17 +17,17 @@ from deltas_nets.outputs.atomic_files import write_atomically
 __all__ = ["check_mesh_extra", "write_cloud_ply", "write_glb", "write_mesh_ply"]
 
 
-def write_cloud_ply(path: Path, cloud: CloudPoints) -> None:
+def write_cloud_ply(path: Path, cloud: CloudPoints, up: FloatArray | None = None) -> None:
     """Write points with normals and colours as binary PLY; see `write_mesh_ply`."""
     vertices = vertices_of(xyz=cloud.points, normal=cloud.normals, rgb=cloud.colors)
     content = header_of(vertices.dtype, len(vertices)) + vertices.tobytes()
     write_atomically(path, lambda file: file.write(content))
 
 
-def write_mesh_ply(path: Path, mesh: Mesh) -> None:
+def write_mesh_ply(path: Path, mesh: Mesh, up: FloatArray | None = None) -> None:
     """Write a mesh with coloured vertices as binary PLY.
 
-    Coordinates are float, or double where they are too large for it.
+    Coordinates are the world's, wherever its ``up`` is: float, or double where they are too large.
     """
     vertices = vertices_of(xyz=mesh.vertices, rgb=mesh.colors)
     more = (f"element face {len(mesh.faces)}", "property list uchar int vertex_indices")
@@ -51,11 +53,16 @@ def check_mesh_extra(path: Path) -> None:
         raise UserError("GLB needs the package trimesh", path, remedy)
 
 
-def write_glb(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as GLB, which browsers and Blender show.
+def write_glb(path: Path, mesh: Mesh, up: FloatArray) -> None:
+    """Write a mesh as GLB, which browsers and Blender show upright: y is up in glTF.
 
-    Axes are glTF's, y up and z towards the viewer, where the world's are OpenCV's. GLB has float32
-    alone: coordinates count from the middle of the mesh, and a node moves them there.
+    The scene's extras say how the world was turned, and where it is up. GLB has float32 alone:
+    coordinates count from the middle of the mesh, and a node moves and turns them.
+
+    Args:
+        path: the file.
+        mesh: in the world.
+        up: ``(3,)`` of the world.
     """
     import trimesh
 
@@ -63,9 +70,12 @@ def write_glb(path: Path, mesh: Mesh) -> None:
     local = trimesh.Trimesh(
         mesh.vertices - middle, mesh.faces, vertex_colors=mesh.colors, process=False
     )
-    moved = np.eye(4)
+    turned, moved = np.eye(4), np.eye(4)
+    turned[:3, :3] = y_up_from_world(up)
     moved[:3, 3] = middle
     scene = trimesh.Scene()
-    scene.add_geometry(local, node_name="mesh", transform=np.diag([1.0, -1.0, -1.0, 1.0]) @ moved)
+    scene.add_geometry(local, node_name="mesh", transform=turned @ moved)
+    scene.metadata["up_in_world"] = up.tolist()
+    scene.metadata["gltf_from_world"] = turned.tolist()
     content = scene.export(file_type="glb")
     write_atomically(path, lambda file: file.write(content))

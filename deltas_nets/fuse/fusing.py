@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from deltas_nets.captures.upright import up_of
 from deltas_nets.errors import UserError
 from deltas_nets.fuse.cloud import Cloud
 from deltas_nets.fuse.config import FuseConfig
@@ -110,7 +111,7 @@ def fuse_capture(
             (out / FUSE_STATE).unlink(missing_ok=True)
             raise _nothing(source, left_out, sizes, config)
         for name, file in files.items():
-            FUSED[name].write(file, made[FUSED[name].of])
+            FUSED[name].write(file, made[FUSED[name].of], up_of(source.capture))
     ended = {"status": "complete", "frames": len(source.ids), **counts}
     ended["left_out"] = {name: round(part, 4) for name, part in left_out._asdict().items()}
     write_json(out / FUSE_SUMMARY, {**head, **ended, "settings": settings})

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from deltas_nets.captures.frame import FloatArray
 from deltas_nets.fuse.files import check_mesh_extra, write_cloud_ply, write_glb, write_mesh_ply
 
 __all__ = ["FUSED", "FusedName", "FusedProduct"]
@@ -17,13 +18,13 @@ class FusedProduct(NamedTuple):
     Attributes:
         file: its name.
         of: what it is made of: a cloud's points or a volume's surface.
-        write: writes it.
+        write: writes it, of a world with an up as `up_of` tells it.
         check: raises `UserError` where it cannot be written here.
     """
 
     file: str
     of: Literal["points", "surface"]
-    write: Callable[[Path, Any], None]
+    write: Callable[[Path, Any, FloatArray], None]
     check: Callable[[Path], None] = lambda _: None
 
 

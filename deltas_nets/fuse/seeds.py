@@ -24,6 +24,7 @@ from deltas_nets.fuse.agreement import agreement
 from deltas_nets.fuse.depth_view import DepthView, nearest
 from deltas_nets.fuse.neighbours import neighbours
 from deltas_nets.fuse.sources import DepthSource
+from deltas_nets.outputs.depth_formats import DEPTH_FORMATS
 from deltas_nets.outputs.summary import recorded_depth_scale
 
 __all__ = ["seeds", "with_maps"]
@@ -39,27 +40,21 @@ SAME = 0.02
 """Share of the depth by which a map may miss a point that it is said to see."""
 
 
-def with_maps(capture: Capture, folder: Path, *, wanted: bool = True) -> Capture:
+def with_maps(capture: Capture, folder: Path) -> Capture:
     """The capture with maps of `deltas depth` in the place of what a sensor measured.
 
     Args:
         capture: in the unit of the maps.
         folder: of the maps; frames without one have no depth.
-        wanted: False where the capture may do without them, as for a format that holds no depth.
-
-    Raises:
-        UserError: the maps are of a format that captures do not hold, and they are wanted.
     """
     # Whole, as frames join what is relative to the capture's own folder.
     folder, scale = folder.resolve(), recorded_depth_scale(folder)
     frames = []
     for frame in capture.frames.values():
-        file = folder / "depth" / f"{frame.id}.png"
-        told = {"depth_path": file, "depth_scale": scale} if file.exists() else NO_DEPTH
+        files = (folder / "depth" / f"{frame.id}.{name}" for name in DEPTH_FORMATS)
+        file = next(filter(Path.exists, files), None)
+        told = {"depth_path": file, "depth_scale": scale, "depth_unit": 1.0}
         frames.append(replace(frame, **{**NO_DEPTH, **told}))
-    if wanted and all(frame.depth_path is None for frame in frames):
-        what = "the maps are not PNG, which captures hold depth in"
-        raise UserError(what, folder, "run deltas depth with --format png")
     return replace(capture, frames=Frames.of(frames, capture.frames.folder))
 
 

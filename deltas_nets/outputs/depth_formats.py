@@ -79,7 +79,13 @@ def read_depth_png(path: Path, scale: float = MILLIMETRES) -> NDArray[np.float32
     with Image.open(path) as image:
         if not image.mode.startswith("I"):
             raise ValueError(f"16 bits of one channel are expected, got {image.mode}")
-        return (np.asarray(image) / np.float64(scale)).astype(np.float32)
+        steps = np.asarray(image)
+    single = np.float32(scale)
+    if steps.dtype != np.uint16 or float(single) != scale:
+        return (steps / np.float64(scale)).astype(np.float32)
+    # The same to the last bit, as both are exact in float32, in a third of the memory.
+    depth = steps.astype(np.float32)
+    return np.divide(depth, single, out=depth)
 
 
 def _write_npz(path: Path, depth: ArrayLike, scale: float, unit: str) -> None:

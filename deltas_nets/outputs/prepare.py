@@ -8,6 +8,7 @@ from typing import Any
 
 from deltas_nets.captures.ids import id_in_json
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import LOCK
 from deltas_nets.outputs.atomic_files import (
     TEMPORARY,
     cannot_write,
@@ -29,7 +30,7 @@ from deltas_nets.outputs.summary import (
     shard_summary,
 )
 
-__all__ = ["check_place", "prepare_output"]
+__all__ = ["check_continues", "check_place", "prepare_output"]
 
 
 def prepare_output(
@@ -144,9 +145,39 @@ def _earlier(
     if overwrite:
         return earlier
     if earlier and earlier[0]["settings"] != wanted:
-        what = f"an earlier run had other settings ({difference(earlier[0], wanted, scaled_by)})"
-        raise UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
+        raise _other_settings(out, earlier[0], wanted, scaled_by)
     return earlier
+
+
+def check_continues(out: Path, settings: Mapping[str, Any], scaled_by: float | None = None) -> None:
+    """Whether a run would go on with an earlier one, as far as some of its settings tell.
+
+    Args:
+        out: the folder; nothing in it is changed.
+        settings: those that are known so far, of the prediction as well; with the value None
+            those that are there only where they are asked for.
+        scaled_by: what the capture is multiplied with.
+
+    Raises:
+        UserError: the earlier run had others.
+    """
+    wanted = json.loads(json.dumps(plain(settings)))
+    for earlier in _summaries(out)[:1]:
+        found = earlier["settings"]
+        predict = found.get("predict")
+        if not isinstance(predict, dict):  # of another version
+            continue
+        known = {name: found.get(name) for name in wanted if name != "predict"}
+        known["predict"] = {name: predict.get(name) for name in wanted["predict"]}
+        if known != wanted:
+            raise _other_settings(out, earlier | {"settings": known}, wanted, scaled_by)
+
+
+def _other_settings(
+    out: Path, earlier: Mapping[str, Any], wanted: Mapping[str, Any], scaled_by: float | None
+) -> UserError:
+    what = f"an earlier run had other settings ({difference(earlier, wanted, scaled_by)})"
+    return UserError(what, out / SUMMARY, "name another folder, or add --overwrite")
 
 
 def _summaries(out: Path, *, alone: bool = True) -> list[dict[str, Any]]:
@@ -157,7 +188,7 @@ def _summaries(out: Path, *, alone: bool = True) -> list[dict[str, Any]]:
     """
     # Listed before the summaries are read: what another shard has made by now has a summary.
     found = sorted(os.listdir(out)) if out.exists() else []
-    others = [name for name in found if not TEMPORARY.match(name)]
+    others = [name for name in found if not TEMPORARY.match(name) and not LOCK.fullmatch(name)]
     names = [SUMMARY, *filter(SHARD_SUMMARY.fullmatch, others)]
     earlier = [read for name in names if (read := read_summary(out / name)) is not None]
     if alone and others and not earlier:

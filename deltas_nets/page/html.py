@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deltas_nets import __version__
+from deltas_nets.captures.upright import up_of
 from deltas_nets.evaluate.depth_metrics import DepthMetrics, mean_metrics
 from deltas_nets.outputs.beside import mark_of_page
 from deltas_nets.outputs.verdict import verdict
 from deltas_nets.page.colours import NONE, Scale, lookup_table, ticks_of
 from deltas_nets.page.maps import Maps
 from deltas_nets.page.pictures import FramePictures, jpeg, scales_of
-from deltas_nets.page.scene import Camera, Layer, camera_of, up_of
+from deltas_nets.page.scene import Camera, Layer, camera_of
 from deltas_nets.terminal import counted
 
 __all__ = ["ShownFrame", "bytes_of_frame", "bytes_of_layer", "html_of", "shown_frame"]

@@ -12,6 +12,7 @@ from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.register import register_depth
 from deltas_nets.captures.spread import spread
 from deltas_nets.captures.work_size import depth_at_image
+from deltas_nets.errors import UserError
 from deltas_nets.evaluate.depth_metrics import DepthMetrics
 from deltas_nets.evaluate.scores import resize_nearest, score_map
 from deltas_nets.page.colours import CONFIDENCE, ERROR, Scale, coloured
@@ -44,11 +45,13 @@ class FramePictures(NamedTuple):
         pictures: ``(H, W, 3)`` by name: image, depth and, where they are known, confidence, truth
             and error.
         score: against sensor depth; None where there is none.
+        unread: why there is none, though there is a file of it.
     """
 
     id: str
     pictures: dict[str, Picture]
     score: DepthMetrics | None
+    unread: UserError | None = None
 
 
 def sample_of_depth(maps: Maps) -> NDArray[np.float32]:
@@ -96,7 +99,7 @@ def pictures_of(
         longest: pixels of the longer side; never more than the map has.
 
     Raises:
-        UserError: a file cannot be read.
+        UserError: a file cannot be read, and it is not that of the sensor depth.
     """
     frame, confidence = maps.capture.frame(id), maps.confidence(id)
     size = size_within(depth.shape, longest)
@@ -108,7 +111,10 @@ def pictures_of(
     if confidence is not None:
         sure = 100 * resize_nearest(confidence, size)
         pictures["confidence"] = coloured(sure, CONFIDENCE, known=small > 0)
-    truth = _true_depth(frame, maps)
+    try:
+        truth = _true_depth(frame, maps)
+    except UserError as refused:  # a page without the errors of a frame is better than none
+        return FramePictures(id, pictures, None, refused)
     if truth is None:
         return FramePictures(id, pictures, None)
     score = score_map(depth, truth, depth_range, None)

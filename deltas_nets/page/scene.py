@@ -23,7 +23,6 @@ __all__ = [
     "layers_of",
     "points_of_maps",
     "sparse_layer",
-    "up_of",
 ]
 
 MOST_POINTS, MOST_FACES = 200_000, 200_000
@@ -67,13 +66,6 @@ def camera_of(frame: Frame) -> Camera:
     corners = np.array([[-0.5, width - 0.5], [-0.5, height - 0.5], [1, 1]])
     (left, right), (top, bottom), _ = np.linalg.solve(frame.K, corners).tolist()
     return Camera(frame.id, rigid_inverse(frame.cam_from_world), (left, top, right, bottom))
-
-
-def up_of(capture: Capture) -> FloatArray:
-    """``(3,)`` where up is for most cameras: people hold them level."""
-    up: FloatArray = -capture.frames.cam_from_world[:, 1, :3].mean(axis=0)
-    length = float(np.linalg.norm(up))
-    return up / length if length > 0.2 else np.array([0.0, -1.0, 0.0])
 
 
 def layers_of(maps: Maps) -> list[Layer]:

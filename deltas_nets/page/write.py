@@ -19,6 +19,7 @@ from deltas_nets.page.maps import Maps
 from deltas_nets.page.pictures import pictures_of, sample_of_depth, size_within
 from deltas_nets.page.scene import layers_of
 from deltas_nets.page.sheet import MOST_CELLS, cell_of, contact_sheet
+from deltas_nets.terminal import counted, warn
 
 __all__ = ["Page", "write_page"]
 
@@ -66,7 +67,8 @@ def write_page(
         report: called with the id of every finished frame.
 
     Raises:
-        UserError: a file cannot be read or written. The page of before, if any, stays then.
+        UserError: a file cannot be read or written. The page of before, if any, stays then. Of
+            sensor depth that cannot be read it is a warning.
     """
     folder = maps.folder
     remove_temporary((folder / PREVIEWS).rglob("*"))
@@ -82,16 +84,19 @@ def write_page(
         maps.ids, room, lambda id, longest: bytes_of_frame(shown(id, maps.depth(id), longest))
     )
     on_page, on_sheet = set(chosen.ids), set(spread(chosen.ids, MOST_CELLS))
-    frames, cells = [], []
+    frames, cells, unread = [], [], []
     for id in maps.ids:
         depth = maps.depth(id)
         _write_preview(preview_file(folder, id), depth, scale)
         if id in on_page:
             found = pictures_of(maps, id, depth, scale, depth_range, chosen.longest)
             frames.append(shown_frame(found))
+            unread += [] if found.unread is None else [found.unread]
             if id in on_sheet:
                 cells.append(cell_of(found))
         report(id)
+    if unread:
+        warn(f"the page is without errors of {counted(len(unread), 'frame')}: {unread[0]}")
     _write_jpeg(folder / SHEET, contact_sheet(cells, scale))
     content = html_of(maps, frames, layers, scale, depth_range)
     while len(content) > MOST_BYTES and len(frames) > 2:  # where few frames misled the choice

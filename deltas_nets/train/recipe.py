@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from deltas_nets.config.recipes import Recipe, RecipeName
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.alone import LOCK
 from deltas_nets.outputs.atomic_files import write_json
 from deltas_nets.train.checkpoint import CHECKPOINT
 from deltas_nets.train.fit import fit
@@ -52,7 +53,8 @@ def begin(folder: Path, beginning: Beginning) -> None:
     """
     file, record = folder / RECORD, beginning.record()
     if not file.exists():
-        if folder.exists() and any(folder.iterdir()):
+        found = folder.iterdir() if folder.exists() else ()
+        if any(not LOCK.fullmatch(file.name) for file in found):
             what = "the folder holds something else"
             raise UserError(what, folder, "name a new folder with --out")
         folder.mkdir(parents=True, exist_ok=True)

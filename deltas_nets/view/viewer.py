@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.spread import spread
+from deltas_nets.captures.upright import up_of
 from deltas_nets.errors import UserError
 from deltas_nets.page.maps import Maps
 from deltas_nets.page.pictures import size_within
@@ -25,7 +26,6 @@ from deltas_nets.page.scene import (
     fused_layers,
     points_of_maps,
     sparse_layer,
-    up_of,
 )
 
 if TYPE_CHECKING:

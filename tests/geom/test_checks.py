@@ -3,12 +3,13 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deltas_geom import ShapeError
+from deltas_geom import Lens, ShapeError, pixel_grid, rasterize_depth, undistort_image
 from deltas_geom.checks import (
     batch_shape,
     check_bool,
@@ -78,6 +79,20 @@ def test_far_may_be_infinite() -> None:
 def test_an_image_has_a_pixel() -> None:
     with pytest.raises(ValueError, match="height, width"):
         check_image_size((0, 3))
+
+
+@pytest.mark.parametrize("size", [(4.0, 6), (4, 6.5), (np.float32(4), 6), (np.float64(4), 6)])
+def test_an_image_has_a_whole_number_of_pixels(size: tuple[int, int]) -> None:
+    pixels = torch.zeros(5, 2)
+    lens = Lens(torch.eye(3), torch.zeros(1), "SIMPLE_RADIAL")
+    for use in (
+        lambda: rasterize_depth(pixels, torch.ones(5), image_size=size),
+        lambda: undistort_image(lens, torch.zeros(1, 4, 6), new_size=size),
+        lambda: pixel_grid(size),
+    ):
+        with pytest.raises(TypeError, match=r"image_size must hold whole numbers, got .*: use int"):
+            use()
+    check_image_size((np.int64(4), 6))  # type: ignore[arg-type]
 
 
 def test_a_plus_asks_for_one_or_more() -> None:

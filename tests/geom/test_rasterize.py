@@ -140,6 +140,22 @@ def test_a_share_below_rounding_is_no_share() -> None:
         assert gradient.isfinite().all()
 
 
+@pytest.mark.parametrize("splat", ["pixel", "bilinear"])
+@pytest.mark.parametrize("size", [1e-45, 1e-40, 1e-37, 1.0, 1e37, 3e38])
+def test_a_mean_does_not_depend_on_the_size_of_weights(size: float, splat: str) -> None:
+    pixels = torch.tensor([[0.0, 0.0], [0.0, 0.0], [2.0, 0.0]], requires_grad=True)
+    depth = torch.tensor([1.0, 3.0, 5.0], requires_grad=True)
+    weights = torch.full((3,), size).requires_grad_(True)
+    sparse = rasterize_depth(
+        pixels, depth, image_size=(1, 3), weights=weights, reduce="mean", splat=splat
+    )
+    assert_close(sparse.depth.flatten(), torch.tensor([2.0, 0, 5]))
+    assert sparse.weight.isfinite().all() and (sparse.weight > 0).sum() == 2
+    inputs = (depth, weights) if splat == "pixel" else (pixels, depth, weights)
+    for gradient in torch.autograd.grad(sparse.depth.sum(), inputs):
+        assert not gradient.isnan().any()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_right(kind: tuple[str, str]) -> None:
     generator = torch.Generator().manual_seed(0)

@@ -60,6 +60,24 @@ def test_a_step_that_would_overshoot_is_not_taken() -> None:
     assert (project(scene.views, refined.points).in_front.all(dim=0) == refined.valid).all()
 
 
+@pytest.mark.parametrize("loss", ["squared", "huber"])  # which have one minimum
+def test_a_step_that_was_refused_is_tried_shorter(loss: Loss) -> None:
+    """Points far beyond their place, where the first step would go behind the cameras."""
+    scene, farther = scene_at(20, num_views=3, count=20), torch.linspace(1, 4, 20).double()
+    proj, pixels = scene.views.proj, scene.pixels
+    eye = torch.linalg.solve(proj[0, :, :3], -proj[0, :, 3])
+    best = refine_points(proj, pixels, scene.points, steps=60, loss=loss, scale=SCALE).points
+    start = eye + farther[:, None] * (best - eye)
+    once = refine_points(proj, pixels, start, loss=loss, scale=SCALE)
+    assert ((once.points == start).all(dim=-1) & once.valid).sum() > 5
+    found = refine_points(proj, pixels, start, steps=60, loss=loss, scale=SCALE)
+    assert found.valid.all()
+    assert_close(found.points, best, rtol=0, atol=1e-6)  # m
+    start.requires_grad_(True)
+    moved = refine_points(proj, pixels, start, steps=60, loss=loss, scale=SCALE).points
+    assert torch.autograd.grad(moved.sum(), start)[0].abs().max() < 1e-3  # of the start
+
+
 @given(scene=posed_scenes(num_views=3), loss=st.sampled_from(LOSSES))
 def test_a_point_without_noise_stays(scene: PosedScene, loss: Loss) -> None:
     refined = refine_points(

@@ -108,6 +108,19 @@ def _long(K: np.ndarray) -> np.ndarray:
     return with_focal(K, 36 * 2 * K[0, 2] / K[0, 0])
 
 
+def before_a_turn(_: int, frame: Frame) -> Frame:
+    """The camera of an image before it was turned by 90 degrees counterclockwise."""
+    height, _width = frame.image_size
+    K, turn = np.eye(3), np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    K[0, 0], K[1, 1] = frame.K[1, 1], frame.K[0, 0]
+    K[:2, 2] = height - 1 - frame.K[1, 2], frame.K[0, 2]
+    return replace(frame, K=K, cam_from_world=turn @ frame.cam_from_world)
+
+
+def pose_before_a_turn(i: int, frame: Frame) -> Frame:
+    return replace(before_a_turn(i, frame), K=frame.K)
+
+
 MATCHES: dict[str, tuple[Plant, Fault]] = {
     "inverted": (poses(np.linalg.inv), Fault.POSES_INVERTED),
     "OpenGL": (poses(lambda pose: FLIP @ pose), Fault.OPENGL_AXES),
@@ -130,6 +143,8 @@ MATCHES: dict[str, tuple[Plant, Fault]] = {
         Fault.DEPTH_SCALE,
     ),
     "one pose in ten": (poses(_moved), Fault.FRAMES_DISAGREE),
+    "turned images": (frames(before_a_turn), Fault.IMAGES_TURNED),
+    "turned images and K": (frames(pose_before_a_turn), Fault.IMAGES_TURNED_BESIDE_POSES),
 }
 """Faults that matches tell."""
 

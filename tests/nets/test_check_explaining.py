@@ -1,13 +1,23 @@
 """A cause is named only if it explains: what is left is small, of nearly all frames, and known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from check_plants import UNITY, frames, in_parts, poses, scaled
+from check_plants import (
+    UNITY,
+    before_a_turn,
+    frames,
+    in_parts,
+    pose_before_a_turn,
+    poses,
+    scaled,
+)
 from PIL import Image
 from room_capture import write_scene
 
+from deltas_geom.diagnosis.evidence import residuals
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.check.axes import other_axes
@@ -17,7 +27,8 @@ from deltas_nets.check.guesses import improved_guess
 from deltas_nets.check.judging import judge_matches
 from deltas_nets.check.matched import Matched, match_capture
 from deltas_nets.check.time_shift import poses_of_other_frames
-from deltas_nets.check.trying import Tried
+from deltas_nets.check.trying import Case, Tried
+from deltas_nets.check.turned import Turn, turned_images, turned_images_of_right_K
 from deltas_nets.check.unmatched import unmatched_frames
 from deltas_nets.check.verdict import check_capture
 from deltas_nets.rooms import render_room
@@ -56,6 +67,30 @@ def test_a_left_handed_world_of_six_frames_is_no_shift_of_frames(few: Looked) ->
     (found,) = judge_matches(planted, matched)[0]
     assert found.cause is Fault.OTHER_AXES and found.mend is not None
     assert judge_matches(found.mend(planted), matched)[0] == []
+
+
+@pytest.mark.parametrize("with_K", [True, False])
+def test_turned_images_are_named_and_their_cameras_found(with_K: bool, few: Looked) -> None:
+    capture, matched = few
+    planted = frames(before_a_turn if with_K else pose_before_a_turn)(capture)
+    evidence = evidence_of(matched)
+    case = Case(planted, matched, evidence, residuals(evidence, *matched.views(planted.frames)))
+    tried = turned_images(case) if with_K else turned_images_of_right_K(case)
+    found = min(tried, key=lambda suspect: suspect.tried.after).finding
+    assert found.cause is (Fault.IMAGES_TURNED if with_K else Fault.IMAGES_TURNED_BESIDE_POSES)
+    assert "by 90 degrees clockwise" in found.evidence and found.mend is not None
+    mended = found.mend(planted).frames
+    assert np.allclose(mended.K, capture.frames.K)
+    assert np.allclose(mended.cam_from_world, capture.frames.cam_from_world)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_quarter_and_what_is_left_of_a_turn_are_none(quarters: int, few: Looked) -> None:
+    frame = few[0].frame(0)
+    there = Turn(quarters, with_K=True).mended(0, frame)
+    lying = replace(there, image_size=frame.image_size[:: -1 if quarters % 2 else 1])
+    back = Turn(4 - quarters, with_K=True).mended(0, lying)
+    assert np.allclose(back.K, frame.K) and np.allclose(back.cam_from_world, frame.cam_from_world)
 
 
 @pytest.mark.parametrize(("late", "told"), [(1, True), (3, False)])

@@ -11,12 +11,14 @@ from hypothesis.extra import numpy as arrays
 from PIL import Image
 from written_captures import exr, make_scene, sevenscenes
 
+from deltas_nets.captures.depth_files import holds_floats
 from deltas_nets.captures.exr import read_exr
 from deltas_nets.captures.float_files import read_npy, read_pfm
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.register import register_depth
 from deltas_nets.errors import UserError
+from deltas_nets.outputs.depth_formats import read_depth_png
 
 FILE = Path("depth")
 MAPS = arrays.arrays(np.float16, arrays.array_shapes(min_dims=2, max_dims=2, max_side=40))
@@ -114,3 +116,74 @@ def test_edges_of_registered_depth_are_edges_of_the_image(shared_data: Path) -> 
     registered = np.mean([agreement(register_depth(frame), image) for frame, image in pairs])
     unregistered = np.mean([agreement(frame.read_depth(), image) for frame, image in pairs])
     assert registered > 1.3 * unregistered
+
+
+WHOLE = np.array([[0, 1500], [2000, 65535]], dtype=np.uint16)
+KNOWN = np.array([[0, 1.5], [2, 0]], dtype=np.float32)
+
+
+def depth_of(file: Path, **more: float) -> np.ndarray:
+    return Frame("0", file, (2, 2), np.eye(3), np.eye(4), depth_path=file, **more).read_depth()
+
+
+def save(file: Path, depth: np.ndarray) -> Path:
+    if file.suffix == ".npy":
+        np.save(file, depth)
+    elif file.suffix == ".npz":
+        np.savez(file, depth=depth, unit=np.array("m"))
+    else:
+        Image.fromarray(depth).save(file)
+    return file
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "npy", "npz"])
+def test_whole_numbers_are_steps_in_whatever_file(tmp_path: Path, suffix: str) -> None:
+    file = save(tmp_path / f"depth.{suffix}", WHOLE)
+    assert not holds_floats(file)
+    assert depth_of(file).tolist() == KNOWN.tolist()
+    assert depth_of(file, depth_scale=500.0, depth_unit=9.0).tolist() == (2 * KNOWN).tolist()
+
+
+@pytest.mark.parametrize("suffix", ["tiff", "npy", "npz"])
+def test_floats_are_in_the_unit_in_whatever_file(tmp_path: Path, suffix: str) -> None:
+    depth = np.array([[np.nan, 1.5], [2, -1]], dtype=np.float32)
+    file = save(tmp_path / f"depth.{suffix}", depth)
+    assert holds_floats(file)
+    assert depth_of(file).tolist() == KNOWN.tolist()
+    assert depth_of(file, depth_scale=500.0, depth_unit=2.0).tolist() == (2 * KNOWN).tolist()
+
+
+def test_micrometres_in_32_bits_do_not_end_at_65535(tmp_path: Path) -> None:
+    file = save(tmp_path / "depth.npy", np.array([[1_500_000, 70_000]], dtype=np.int32))
+    assert depth_of(file, depth_scale=1e6).tolist() == [[1.5, np.float32(0.07)]]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, which commands do not show
+@pytest.mark.parametrize("suffix", ["tiff", "npy", "npz"])
+def test_a_cut_file_is_an_error_wherever_it_is_cut(tmp_path: Path, suffix: str) -> None:
+    file = save(tmp_path / f"depth.{suffix}", KNOWN)
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 7):
+        file.write_bytes(whole[:length])
+        with pytest.raises(UserError):
+            depth_of(file)
+        holds_floats(file)
+
+
+def test_an_npz_of_several_arrays_has_one_called_depth(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", a=KNOWN, b=KNOWN)
+    with pytest.raises(UserError, match="no array called depth"):
+        depth_of(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", a=KNOWN)
+    assert depth_of(tmp_path / "b.npz").tolist() == KNOWN.tolist()
+    np.save(tmp_path / "c.npy", KNOWN > 0)
+    with pytest.raises(UserError, match="yes and no"):
+        depth_of(tmp_path / "c.npy")
+
+
+@pytest.mark.parametrize("scale", [1000.0, 5000.0, 256.0, 1234.567, 0.1])
+def test_every_step_is_read_to_the_last_bit(tmp_path: Path, scale: float) -> None:
+    steps = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
+    Image.fromarray(steps).save(tmp_path / "map.png")
+    wanted = (steps / np.float64(scale)).astype(np.float32)
+    assert (read_depth_png(tmp_path / "map.png", scale) == wanted).all()

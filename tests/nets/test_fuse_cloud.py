@@ -87,10 +87,17 @@ def test_another_program_reads_our_meshes(tmp_path: Path, at: tuple[float, float
     assert_close(np.asarray(read.vertices), mesh.vertices, rtol=0, atol=1e-6)
     assert np.asarray(read.faces).tolist() == mesh.faces.tolist()
     assert (np.asarray(read.visual.vertex_colors)[:, :3] == mesh.colors).all()
-    write_glb(tmp_path / "mesh.glb", mesh)
+    write_glb(tmp_path / "mesh.glb", mesh, np.array([0.0, -1, 0]))
     shown = trimesh.load(tmp_path / "mesh.glb", process=False).to_mesh()
     opengl = mesh.vertices * (1, -1, -1)  # glTF's axes
     assert_close(np.asarray(shown.vertices), opengl, rtol=0, atol=1e-6)
+    write_glb(tmp_path / "mesh.glb", mesh, np.array([0.0, 0, 1]))
+    scene = trimesh.load(tmp_path / "mesh.glb", process=False)
+    upright = mesh.vertices[:, [0, 2, 1]] * (1, 1, -1)  # of a world whose z is up
+    assert_close(np.asarray(scene.to_mesh().vertices), upright, rtol=0, atol=1e-6)
+    assert scene.metadata["up_in_world"] == [0, 0, 1]
+    turned = np.array(scene.metadata["gltf_from_world"])[:3, :3]
+    assert_close(upright @ turned, mesh.vertices, rtol=0, atol=1e-6)  # nothing is lost
 
 
 @pytest.mark.parametrize("at", [0.0, 5e6])

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from PIL import Image, ImageFile
 from run_command import Run
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.images import ImageMemory, header_of_whole_file
+from deltas_nets.captures.images import ImageMemory, decode, header_of_whole_file
 from deltas_nets.errors import UserError
+from deltas_nets.terminal import without_warnings_of_pillow
 
 MakeCapture = Callable[..., Path]
 
@@ -103,3 +105,17 @@ def test_a_frame_without_depth_says_so(capture: Capture) -> None:
     for read in (blind.check_depth, blind.read_depth):
         with pytest.raises(UserError, match="frame 0 has no sensor depth"):
             read()
+
+
+def test_a_damaged_tiff_is_told_in_our_words_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file, pixels = tmp_path / "image.tiff", np.random.default_rng(0).integers(0, 255, (60, 60, 3))
+    Image.fromarray(pixels.astype(np.uint8)).save(file, compression="tiff_deflate")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:8] + bytes(2000) + whole[2008:])
+    for silent in (True, False):
+        quiet = without_warnings_of_pillow() if silent else nullcontext()
+        with quiet, pytest.raises(UserError, match="cannot be decoded"):
+            decode(file, remedy="copy it again")
+        assert ("ZIPDecode" in capfd.readouterr().err) is not silent  # and is as before after it

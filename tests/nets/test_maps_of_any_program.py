@@ -65,3 +65,21 @@ def test_maps_of_another_name_are_told_how_to_be_written(
 def test_maps_of_another_kind_are_told_how_to_be_written(maps: Path, score: Score) -> None:
     Image.fromarray(STEPS.astype(np.uint8)).save(maps / "1.png")
     assert_one_line(score(), "16 bits of one channel", "write ID.png (16-bit millimetres), ID.npz")
+
+
+@pytest.mark.parametrize("nothing", [0, np.nan, -1])
+def test_maps_without_any_depth_are_not_scored(maps: Path, score: Score, nothing: float) -> None:
+    np.savez(maps / "1.npz", depth=np.full_like(DEPTH, nothing))
+    assert_one_line(score(), "no map has depth where the true depth is, of 1 map", "0 and NaN")
+
+
+def test_an_empty_map_among_others_is_warned_of(maps: Path, score: Score, tmp_path: Path) -> None:
+    (tmp_path / "sets.json").write_text(
+        '[{"anchor": 1, "sources": [0]}, {"anchor": 2, "sources": [0]}]'
+    )
+    np.savez(maps / "1.npz", depth=DEPTH)
+    np.savez(maps / "2.npz", depth=0 * DEPTH)
+    told = score()
+    assert told.code == 0
+    assert "1 of 2 maps have no depth where the true depth is" in told.err
+    assert told.err.rstrip().endswith("the first is 2")

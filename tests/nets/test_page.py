@@ -100,6 +100,20 @@ def test_errors_are_those_of_evaluate(filled: tuple[Path, Path]) -> None:
     assert facts["δ < 1.25"] == f"{scores.dense.delta1:.3f}"
 
 
+def test_sensor_depth_that_is_damaged_leaves_out_the_errors_of_its_frame_alone(
+    filled: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture, folder = filled
+    damaged = capture / "depth" / "2.png"
+    damaged.write_bytes(damaged.read_bytes()[:-30])
+    assert page_of(capture, folder).shown == 4
+    frames = {frame["id"]: frame["pictures"].keys() for frame in data_of(folder)["frames"]}
+    assert [id for id, pictures in frames.items() if "error" not in pictures] == ["2"]
+    said = capsys.readouterr().err
+    what = "the page is without errors of 1 frame: the sensor depth cannot be decoded"
+    assert said.count("warning") == 1 and what in said and str(damaged) in said
+
+
 def test_points_of_the_maps_are_shown_where_they_are(filled: tuple[Path, Path]) -> None:
     capture, folder = filled
     (layer,) = layers_of(open_maps(open_capture(capture), folder))

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 from conftest import MakeCapture
 from PIL import Image
 from run_command import Run, assert_one_line
-from small_maps import write_maps
+from small_maps import map_of, write_maps
 
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import save_capture
@@ -116,8 +117,23 @@ def test_points_of_maps_in_floats_go_into_a_model(run: Run, capture: Path, tmp_p
     assert said.code == 0, said.err
     points = open_capture(tmp_path / "model").points
     assert points is not None and len(points.xyz) > 100
-    refused = run("convert", capture, tmp_path / "own", "--depths", maps)
-    assert_one_line(refused, "not PNG", "--format png")
+
+
+@pytest.mark.parametrize("to", ["own", "transforms", "scannet"])
+@pytest.mark.parametrize("format", ["npz", "tiff", "pfm"])
+def test_maps_in_floats_go_along_as_depth(
+    run: Run, capture: Path, tmp_path: Path, to: str, format: Literal["npz", "tiff", "pfm"]
+) -> None:
+    options = OutputOptions(depth_format=format)
+    maps = write_maps(capture, tmp_path / "maps", options=options)
+    flags = ("--to", to, "--depths", maps, "--points", 40, "--scale", 2)
+    said = run("convert", capture, tmp_path / "out", *flags)
+    assert said.code == 0, said.err
+    frames = open_capture(tmp_path / "out").frames.values()
+    fine = 1e-3 if to == "scannet" else 1e-6  # which has PNG alone
+    for frame in frames:
+        assert np.abs(frame.read_depth() - 2 * map_of(SIZE)).max() < fine
+        assert to != "transforms" or frame.depth_path is None or frame.depth_path.suffix != ".npz"
 
 
 def test_maps_that_are_not_there_are_counted(run: Run, capture: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from deltas_nets.captures.capture import Capture, Frame
-from deltas_nets.captures.depth_files import FLOATS, MILLIMETRES
+from deltas_nets.captures.depth_files import MILLIMETRES, holds_floats
 from deltas_nets.captures.images import Span, decode, open_span
 from deltas_nets.captures.readers.names import DEPTH_SUFFIXES
 from deltas_nets.captures.register import register_depth
@@ -29,6 +29,7 @@ __all__ = [
     "put_image",
     "put_image_as_png",
     "put_registered_depth",
+    "write_floats",
     "write_frames_json",
     "write_millimetres",
 ]
@@ -116,8 +117,8 @@ def put_depth(frame: Frame, target: Path, putting: Putting) -> PutDepth | None:
     suffix = frame.depth_path.suffix.lower()
     if frame.depth_span is not None or suffix not in DEPTH_SUFFIXES:
         return write_millimetres(frame.read_depth(), target, frame)
-    if suffix in FLOATS and frame.depth_unit != 1:
-        return _write_floats(frame.read_depth(), target, frame)
+    if frame.depth_unit != 1 and holds_floats(frame.depth_path):
+        return write_floats(frame.read_depth(), target, frame)
     file = target.with_name(target.name + suffix)
     _put(_Source(frame.depth_path, None), file, putting.placing, f"depth of {frame.id}")
     return PutDepth(file, frame.depth_scale)
@@ -146,8 +147,8 @@ def write_millimetres(depth: NDArray[np.float32], target: Path, frame: Frame) ->
     return PutDepth(file, MILLIMETRES)
 
 
-def _write_floats(depth: NDArray[np.float32], target: Path, frame: Frame) -> PutDepth:
-    """Write depth ``(H, W)`` in the capture's unit, where its floats are in another."""
+def write_floats(depth: NDArray[np.float32], target: Path, frame: Frame) -> PutDepth:
+    """Write depth ``(H, W)`` as floats in the capture's unit, in a file that all programs read."""
     file = target.with_name(f"{target.name}.npy")
     file.parent.mkdir(parents=True, exist_ok=True)
     np.save(file, depth)

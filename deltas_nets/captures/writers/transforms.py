@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture, Frame
-from deltas_nets.captures.depth_files import FLOATS, MILLIMETRES
+from deltas_nets.captures.depth_files import MILLIMETRES, holds_floats
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.ply_vertices import header_of, vertices_of
 from deltas_nets.captures.points import SparsePoints
@@ -17,6 +17,7 @@ from deltas_nets.captures.writers.files import (
     image_name,
     put_image,
     put_registered_depth,
+    write_floats,
     write_frames_json,
     write_millimetres,
 )
@@ -71,7 +72,7 @@ def _scale(capture: Capture) -> float:
 
 
 def _holds_floats(frame: Frame) -> bool:
-    return frame.depth_path is not None and frame.depth_path.suffix.lower() in FLOATS
+    return frame.depth_path is not None and holds_floats(frame.depth_path)
 
 
 def _frame(frame: Frame, folder: Path, putting: Putting, scale: float) -> dict[str, object]:
@@ -100,6 +101,8 @@ def _put_depth(frame: Frame, target: Path, putting: Putting, scale: float) -> Pu
     steps = 1.0 if _holds_floats(frame) else frame.depth_scale
     as_it_is = steps == scale and frame.depth_span is None
     if frame.depth_path is None or (as_it_is and depth_is_registered(frame)):
+        if frame.depth_path is not None and frame.depth_path.suffix.lower() == ".npz":
+            return write_floats(frame.read_depth(), target, frame)  # nerfstudio reads no NPZ
         return put_registered_depth(frame, target, putting)
     if scale != MILLIMETRES:
         what = f"depth has {scale:g} steps in a unit, and some must be written anew"
