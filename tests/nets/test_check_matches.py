@@ -173,7 +173,7 @@ def test_inverse_depth_is_no_reason_to_scale_poses(look: Look, tmp_path: Path) -
 def test_floats_in_metres_that_are_read_as_millimetres_are_told(look: Look) -> None:
     looked = look("room")
     stored = [
-        replace(frame, depth_path=Path("depth.npy"), depth_unit=0.001, depth_scale=1e6)
+        replace(frame, depth_path=Path("depth.pfm"), depth_unit=0.001, depth_scale=1e6)
         for frame in looked.capture.frames.values()
     ]
     planted = replace(looked.capture, frames=Frames.of(stored), layout="transforms.json")
