@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.text_lines import decoded
 from deltas_nets.errors import UserError
 
 __all__ = ["ViewSet", "check_frames", "doubtful_scale", "named_frames", "read_view_sets"]
@@ -38,7 +39,7 @@ def read_view_sets(
     path = Path(path)
     form = 'write [{"anchor": 10, "sources": [8, 12]}, ...]'
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = json.loads(decoded(path.read_bytes()))
     except OSError as error:
         what = f"the view sets cannot be read ({error.strerror})"
         raise UserError(what, path, "check the path") from error

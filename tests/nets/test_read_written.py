@@ -94,6 +94,18 @@ def test_tum_without_a_camera_names_the_option(scene: Scene, tmp_path: Path) -> 
     assert "--intrinsics freiburg1" in error.value.remedy
 
 
+def test_tum_without_poses_says_so_whether_its_camera_is_known_or_not(
+    scene: Scene, tmp_path: Path
+) -> None:
+    for name in ("freiburg1", "walk"):
+        folder = tum(tmp_path / name, scene).path
+        for file in ("intrinsics.txt", "groundtruth.txt"):
+            (folder / file).unlink()
+        with pytest.raises(UserError) as error:
+            open_capture(folder)
+        assert "permissions" not in error.value.remedy
+
+
 def test_tum_says_what_is_missing_and_does_not_guess_poses(scene: Scene, tmp_path: Path) -> None:
     folder = tum(tmp_path / "walk", scene).path
     lines = (folder / "groundtruth.txt").read_text().splitlines()

@@ -114,8 +114,8 @@ def _camera(path: Path, image_size: tuple[int, int]) -> tuple[Intrinsics, str]:
             text = read_text(path / name, name="intrinsics", remedy=remedy)
             lines = (line.partition("#")[0] for line in text.splitlines())
             return Intrinsics.parse(" ".join(lines), path / name), f", {name}"
-    heads = [_head(path / name) for name in ("rgb.txt", "groundtruth.txt")]
-    for words in (path.resolve().name, *heads):
+    lists = (path / name for name in ("rgb.txt", "groundtruth.txt"))
+    for words in (path.resolve().name, *(_head(file) for file in lists if file.is_file())):
         camera = named_camera(words)
         if camera is None:
             continue
