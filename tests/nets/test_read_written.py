@@ -205,6 +205,16 @@ def test_a_million_lines_take_seconds(scene: Scene, tmp_path: Path) -> None:
     assert time.process_time() - start < 30
 
 
+@pytest.mark.parametrize("unknown", [0, -np.inf, np.inf, np.nan])
+def test_a_sens_that_knows_no_place_of_its_cameras_raises_no_doubt(
+    unknown: float, scene: Scene, tmp_path: Path
+) -> None:
+    file = ALL[".sens"](tmp_path / "capture", scene).path
+    data, known = file.read_bytes(), np.eye(4, dtype="<f4").tobytes()
+    file.write_bytes(data.replace(known, np.full((4, 4), unknown, "<f4").tobytes(), 2))
+    assert not open_capture(file).doubts
+
+
 def _sens_bomb(written: Written) -> None:
     """128 MiB of zeros in the place of the last frame's depth."""
     data = written.path.read_bytes()
