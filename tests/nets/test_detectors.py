@@ -289,6 +289,8 @@ def test_the_command_reads_pairs_without_depth(run: Run, tmp_path: Path) -> None
         (line.replace("0.jpg", "9.jpg"), "no image 9.jpg"),
         (line.replace(" 0 0 128", " 1 0 128", 1), "rotated images"),
         (line.replace("128", "f", 1), "no number"),
+        (line.replace("-0.15", "nan", 1), "no number"),
+        (line.replace("128", "1e999", 1), "no number"),
         ("", "no pairs"),
     ):
         file.write_text(wrong)

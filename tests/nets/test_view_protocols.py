@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from small_capture import write_capture
 
-from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.protocols.deep_video import (
@@ -118,6 +119,13 @@ def test_a_rule_is_recorded_by_name_and_version(walk: Capture) -> None:
     }
     assert ViewProtocol("deepvideomvs").of(walk).record["views"] == 3
     assert ViewProtocol(views=2).of(walk).record == {"name": "chosen", "version": 1, "views": 2}
+
+
+def test_ids_beyond_all_numbers_have_no_gap() -> None:
+    frames = [Frame(f"1{id:024}", Path(), (4, 4), np.eye(3), np.eye(4)) for id in range(4)]
+    capture = Capture(Path("walk"), Frames.of(frames, Path()), {})
+    with pytest.raises(UserError, match="frames without numbers"):
+        fixed_gap_view_sets(capture, 3, gap=1, every=1)
 
 
 def test_what_has_no_sequence_is_refused(walk: Capture, tmp_path: Path) -> None:
