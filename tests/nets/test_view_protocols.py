@@ -121,11 +121,15 @@ def test_a_rule_is_recorded_by_name_and_version(walk: Capture) -> None:
     assert ViewProtocol(views=2).of(walk).record == {"name": "chosen", "version": 1, "views": 2}
 
 
-def test_ids_beyond_all_numbers_have_no_gap() -> None:
-    frames = [Frame(f"1{id:024}", Path(), (4, 4), np.eye(3), np.eye(4)) for id in range(4)]
-    capture = Capture(Path("walk"), Frames.of(frames, Path()), {})
+def test_ids_may_be_nanoseconds_and_not_more() -> None:
+    def at(first: int) -> Capture:
+        ids = (str(first + step) for step in range(4))
+        frames = [Frame(id, Path(), (4, 4), np.eye(3), np.eye(4)) for id in ids]
+        return Capture(Path("walk"), Frames.of(frames, Path()), {})
+
+    assert len(fixed_gap_view_sets(at(2**63 - 4), 3, gap=1, every=1)) == 2
     with pytest.raises(UserError, match="frames without numbers"):
-        fixed_gap_view_sets(capture, 3, gap=1, every=1)
+        fixed_gap_view_sets(at(2**63 - 3), 3, gap=1, every=1)
 
 
 def test_what_has_no_sequence_is_refused(walk: Capture, tmp_path: Path) -> None:

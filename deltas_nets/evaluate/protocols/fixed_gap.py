@@ -38,8 +38,8 @@ def fixed_gap_view_sets(
     Raises:
         UserError: ids are no numbers, or no frame has all its sources.
     """
-    # More digits are beyond int64.
-    if not all(id.isascii() and id.isdigit() and len(id) < 19 for id in capture.frames):
+    # Nanoseconds since 1970 are below 2^63.
+    if not all(id.isascii() and id.isdigit() and int(id) < 2**63 for id in capture.frames):
         what = "frames without numbers have no gap between them"
         raise UserError(what, capture.path, "use --protocol chosen, or name --view-sets")
     rule, frames = ByGap(gap, num_views), capture.frames
