@@ -19,12 +19,17 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import save_capture
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config import DetectorConfig, NetworkConfig
 from deltas_nets.distill.superpoint import SuperPoint
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.detectors.aliked import AlikedExtractor
+from deltas_nets.evaluate.detectors.capture import pairs_of
 from deltas_nets.evaluate.detectors.classical import orb, sift
 from deltas_nets.evaluate.detectors.dense import disk, superpoint
 from deltas_nets.evaluate.detectors.features import DetectionConfig, Features, thinned
@@ -273,6 +278,19 @@ def test_the_command_prints_the_table_and_keeps_what_made_it(
     assert record.rows[1]["matching"] is None  # spread points describe nothing
     assert list(record.weights) == [record.rows[2]["detector"]]
     assert str(tmp_path) not in file.read_text()
+
+
+def test_of_images_with_a_lens_the_first_is_named() -> None:
+    lens, place = Lens("SIMPLE_RADIAL", (0.1,)), Path("depth.png")
+    frames = [
+        Frame(str(id), Path(f"{id}.jpg"), (4, 4), np.eye(3), np.eye(4), place, lens=lens)
+        for id in range(30)
+    ]
+    capture = Capture(Path(), Frames.of(frames, Path()), {})
+    views = [ViewSet(str(id), (str(id - 1),)) for id in range(29, 0, -1)]
+    with pytest.raises(UserError) as error:
+        pairs_of(capture, views)
+    assert error.value.where == Path("29.jpg")
 
 
 def test_the_command_reads_pairs_without_depth(run: Run, tmp_path: Path) -> None:

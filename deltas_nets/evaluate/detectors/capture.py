@@ -28,7 +28,7 @@ def pairs_of(capture: Capture, view_sets: Sequence[ViewSet]) -> list[tuple[str, 
     pairs = [p for p in pairs if all(capture.frame(id).depth_path is not None for id in p)]
     if not pairs:
         raise UserError("no two views with sensor depth", capture.path, "add depth/N.png")
-    for id in {id for pair in pairs for id in pair}:
+    for id in dict.fromkeys(id for pair in pairs for id in pair):
         if capture.frame(id).lens is not None:
             what = "detectors are compared on images without distortion"
             raise UserError(what, capture.frame(id).image_path, "name an undistorted capture")
