@@ -3,6 +3,7 @@
 import contextlib
 import os
 import struct
+import sys
 import time
 import tracemalloc
 import zlib
@@ -58,6 +59,16 @@ def test_polycams_images_stand_in_for_corrected_ones_with_a_warning(
     (keyframes / "corrected_images").rename(keyframes / "images")
     capture = open_capture(tmp_path)
     assert len(capture.frames) == NUM and "corrected_images is missing" in capture.doubts[-1]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux alone")
+def test_polycams_names_that_are_no_text_are_told(scene: Scene, tmp_path: Path) -> None:
+    folder = ALL["Polycam"](tmp_path / "scan", scene).path
+    first = min(path.stem for path in folder.rglob("*.json"))
+    for file in list(folder.rglob(f"{first}.*")):
+        file.rename(file.with_name(os.fsdecode(b"a\xff") + file.suffix))
+    with pytest.raises(UserError, match="an image cannot be called"):
+        open_capture(folder)
 
 
 def test_points_and_their_observations_are_read(scene: Scene, tmp_path: Path) -> None:
