@@ -1,6 +1,6 @@
 """Every step of a series for every network, each measured once."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,7 +95,10 @@ def measure(
         UserError: no such weights, or no step could be measured.
     """
     loaded = {name: load_predictor(name, device) for name in networks}
-    records = {name: _record(name, found) for name, found in loaded.items()}
+    shown = _shown(loaded)
+    records = {
+        name: found.weights_record(name) | {"name": shown[name]} for name, found in loaded.items()
+    }
     rows: list[dict[str, Any]] = []
     for name, predictor in loaded.items():
         for step in series.steps:
@@ -106,14 +109,14 @@ def measure(
             row = journal[key] if key in journal else _row(series, step, predictor, measurement)
             if key not in journal and "note" not in row:  # what is lacking may be there next time
                 journal.add(key, row)
-            rows.append({"weights": "" if step.once else _shown(name), **row})
+            rows.append({"weights": "" if step.once else shown[name], **row})
             report(f"{name} {step.name}")
     if all(row.get("abs_rel") is None for row in rows):
         notes = "; ".join(sorted({str(row["note"]) for row in rows}))
         raise UserError(
             f"nothing was measured ({notes})", series.name, "mend that, or use other weights"
         )
-    return Measured(rows, {_shown(name): record for name, record in records.items()})
+    return Measured(rows, {shown[name]: record for name, record in records.items()})
 
 
 def _row(
@@ -163,13 +166,14 @@ def _network_of(predictor: Predictor) -> nn.Module | None:
     return predictor.model if isinstance(predictor, DensePredictor) else None
 
 
-def _shown(name: str) -> str:
-    """Weights as a table has them: of a file its folder and its name, as many are called alike."""
-    return "/".join(Path(name).parts[-2:])
-
-
-def _record(name: str, predictor: Predictor) -> dict[str, str]:
-    return predictor.weights_record(name) | {"name": _shown(name)}
+def _shown(names: Iterable[str]) -> dict[str, str]:
+    """Weights as a table has them: of files so many folders and the name that no two are alike."""
+    paths = {name: Path(name).parts for name in names}
+    for length in range(2, 1 + max([2, *map(len, paths.values())])):
+        shown = {name: "/".join(parts[-length:]) for name, parts in paths.items()}
+        if len(set(shown.values())) == len(shown):
+            return shown
+    return {name: name for name in paths}  # one path, written in two ways
 
 
 def _identity(record: Mapping[str, str]) -> dict[str, str]:

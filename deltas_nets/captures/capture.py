@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -67,6 +68,16 @@ class Capture:
     """``(F, 2)`` nearest and farthest depth of each frame, if its program states them."""
     form: FileForm = OURS
     """How its files say cameras."""
+
+    @cached_property
+    def points_of_frame(self) -> list[NDArray[np.int64]]:
+        """``(D,)`` for each frame: positions of the sparse points that it sees, as far as told."""
+        if self.points is None:
+            return [np.zeros(0, dtype=np.int64)] * len(self.frames)
+        point, frame, _ = self.points.seen
+        order = np.argsort(frame, kind="stable")
+        starts = np.searchsorted(frame[order], np.arange(1, len(self.frames)))
+        return np.split(point[order], starts)
 
     def fingerprint(self) -> str:
         """A hash of all cameras: what changes when poses or intrinsics do."""

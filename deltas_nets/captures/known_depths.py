@@ -33,7 +33,7 @@ def points_in_view(capture: Capture, position: int, *, least: int = ENOUGH) -> F
     if points is None:
         return None
     told = len(points.seen.frame) > 0
-    xyz = points.xyz[points.of_frame(position)] if told else points.xyz
+    xyz = points.xyz[capture.points_of_frame[position]] if told else points.xyz
     pose = capture.frames.cam_from_world[position]
     found = xyz @ pose[:3, :3].T + pose[:3, 3]
     found = found[found[:, 2] > 0]

@@ -50,8 +50,3 @@ class SparsePoints(NamedTuple):
     rgb: NDArray[np.uint8]
     error: FloatArray
     seen: Observations
-
-    def of_frame(self, position: int) -> NDArray[np.int64]:
-        """``(D,)`` positions of the points that the frame at a position sees."""
-        seen: NDArray[np.int64] = self.seen.point[self.seen.frame == position]
-        return seen

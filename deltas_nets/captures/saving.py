@@ -102,7 +102,7 @@ def save_capture(
         raise UserError("no frame can be used", capture.path, "see why with deltas depth")
     beside = Path(os.path.abspath(out))
     made = [folder for folder in beside.parents if not folder.exists()]
-    temporary = beside.with_name(f".{beside.name}.{secrets.token_hex(4)}.deltas-tmp")
+    temporary = beside.with_name(f".{beside.name[:40]}.{secrets.token_hex(4)}.deltas-tmp")
     try:
         temporary.mkdir(parents=True)
         said = WRITERS[to](capture, temporary, Putting(placing, report))

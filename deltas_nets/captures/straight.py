@@ -96,8 +96,8 @@ class _Seen(NamedTuple):
     @classmethod
     def of(cls, photo: Frame) -> "_Seen":
         """The camera of a photo."""
-        assert photo.lens is not None
-        return cls(photo.K.tobytes(), photo.lens, photo.image_size)
+        lens = photo.lens or FrameLens("PINHOLE", ())
+        return cls(photo.K.tobytes(), lens, photo.image_size)
 
     def resized(self, size: tuple[int, int]) -> Lens:
         """The lens for photos of a size."""
@@ -165,7 +165,7 @@ def _pixels_of(rows: slice, width: int) -> torch.Tensor:
 
 
 def lens_of(photo: Frame) -> Lens:
-    """The lens of a photo that has one, at its own size."""
+    """The lens of a photo at its own size; a pinhole where straight lines are straight in it."""
     return _Seen.of(photo).resized(photo.image_size)
 
 

@@ -35,7 +35,7 @@ NEAREST = 0.04  # in working depths; what is nearer to a candidate does not coun
 COVERAGE = 6.0
 """How much a source gains by the log of the part of the anchor that is seen with it, by the part
 that is seen without."""
-MAX_CANDIDATES = 48  # frames scored by projection for each anchor
+MAX_CANDIDATES = 48  # frames scored by projection for each anchor, where no more are wanted
 
 
 class ChosenViews(NamedTuple):
@@ -107,7 +107,7 @@ def choose_views(
     for id in wanted:
         anchor = index_of[id]
         depth = float(depths[anchor]) if depths is not None else working_depth or 0.0
-        near = _candidates(centres, poses[:, 2, :3], anchor, depth)
+        near = _candidates(centres, poses[:, 2, :3], anchor, depth, num_views - 1)
         probes, nearest = _probes(capture, anchor, depth), NEAREST * depth
         seen = seen_places(capture.frames, near, probes, poses[anchor], nearest=nearest)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
@@ -125,7 +125,7 @@ def choose_views(
 
 
 def _candidates(
-    centres: FloatArray, axes: FloatArray, anchor: int, working_depth: float
+    centres: FloatArray, axes: FloatArray, anchor: int, working_depth: float, wanted: int
 ) -> NDArray[np.intp]:
     """Indices of the frames worth projecting into: near a good baseline, looking alike.
 
@@ -137,7 +137,7 @@ def _candidates(
     # Behind all that are near enough, but ranked.
     cost += np.where((baseline > MAX_BASELINE) | (angle > MAX_ANGLE), 1e6, 0.0)
     cost[anchor] = np.inf
-    count = min(MAX_CANDIDATES, len(centres) - 1)
+    count = min(max(MAX_CANDIDATES, wanted), len(centres) - 1)
     nearest = np.argpartition(cost, count - 1)[:count]
     # In frame order: ties of the score then go to the earlier frame, whatever numpy does.
     return np.sort(nearest)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.centres import camera_centres
+from deltas_nets.captures.text_lines import decoded
 from deltas_nets.errors import UserError
 
 __all__ = ["ViewSet", "check_frames", "doubtful_scale", "named_frames", "read_view_sets"]
@@ -38,7 +40,7 @@ def read_view_sets(
     path = Path(path)
     form = 'write [{"anchor": 10, "sources": [8, 12]}, ...]'
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = json.loads(decoded(path.read_bytes()))
     except OSError as error:
         what = f"the view sets cannot be read ({error.strerror})"
         raise UserError(what, path, "check the path") from error
@@ -143,9 +145,8 @@ def doubtful_scale(
         view_sets: that are used.
         depth_range: (near, far) of the search, metres.
     """
-    centres = {
-        id: np.linalg.inv(capture.frame(id).cam_from_world)[:3, 3] for id in named_frames(view_sets)
-    }
+    poses = ((id, capture.frame(id).cam_from_world) for id in named_frames(view_sets))
+    centres = {id: camera_centres(pose) for id, pose in poses}
     baselines = [
         float(np.linalg.norm(centres[source] - centres[views.anchor]))
         for views in view_sets

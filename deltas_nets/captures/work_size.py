@@ -14,6 +14,7 @@ from deltas_nets.captures.rigid import rigid_inverse
 
 __all__ = [
     "anchor_views",
+    "camera_at",
     "depth_at_image",
     "fit_work_size",
     "load_image",
@@ -77,6 +78,12 @@ def anchor_views(frames: Sequence[Frame], *, work_size: tuple[int, int]) -> Pose
         poses.append(torch.from_numpy(cam_from_anchor))
     poses[0] = torch.eye(4, dtype=torch.float64)  # exactly, not but for rounding
     return PosedViews(torch.stack(intrinsics).float(), torch.stack(poses).float())
+
+
+def camera_at(frame: Frame, size: tuple[int, int]) -> PosedViews:
+    """The camera ``(1)`` of a frame, for its image at a size, where it stands; float64."""
+    K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
+    return PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
 
 
 def fit_work_size(image_size: tuple[int, int], *, max_pixels: int = 240 * 320) -> tuple[int, int]:

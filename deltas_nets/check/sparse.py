@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.straight import lens_of
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.mending import changing_frames, changing_poses
 from deltas_nets.check.rewrite import moved_centre
@@ -72,19 +72,11 @@ def _off(seen: list[tuple[Frame, FloatArray, FloatArray]], scale: float) -> Floa
         pose = frame.cam_from_world
         points = xyz @ pose[:3, :3].T + scale * pose[:3, 3]
         ahead = points[:, 2] > 0
-        projected = _projected(frame, points)
+        projected = lens_of(frame).project(torch.from_numpy(points)).pixels.numpy()
         off = np.where(ahead[:, None] & np.isfinite(projected), pixels - projected, 1e6)
         found.append(off)
     everything: FloatArray = np.concatenate(found)
     return everything
-
-
-def _projected(frame: Frame, points: FloatArray) -> FloatArray:
-    K = torch.from_numpy(frame.K.copy())
-    model, coefficients = ("PINHOLE", ()) if frame.lens is None else (frame.lens[0], frame.lens[1])
-    lens = Lens(K, torch.tensor(coefficients, dtype=torch.float64), model)
-    pixels: FloatArray = lens.project(torch.from_numpy(points)).pixels.numpy()
-    return pixels
 
 
 def _half(shift: float, count: int) -> Finding:

@@ -50,7 +50,7 @@ def run_cost(
         )
     height, width = image_size
     fitting = {name: model for name, model in models.items() if _takes(model, image_size)}
-    for name in models.keys() - fitting.keys():
+    for name in [name for name in models if name not in fitting]:
         left_out = f"{name} takes multiples of {_multiple(models[name])}, not {height} x {width}"
         if not fitting:
             raise UserError(left_out, "command line", "change --size, or name other networks")

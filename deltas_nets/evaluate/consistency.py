@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deltas_geom import PosedViews, project, unproject
-from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.neighbours import neighbours, sample
 from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.work_size import camera_at
 
 __all__ = [
     "AGREES",
@@ -78,8 +78,7 @@ class SeenMaps:
         """
         if frame.lens is not None:
             return
-        K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=SIZE)
-        self._views.append(PosedViews(K[None], torch.tensor(frame.cam_from_world)[None]))
+        self._views.append(camera_at(frame, SIZE))
         self._maps.append(shrunk(depth))
         self._truths.append(shrunk(truth))
 

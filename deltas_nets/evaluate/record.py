@@ -153,7 +153,9 @@ def command_line(arguments: Sequence[str] | None = None) -> str:
         "deltas evaluate 'the walk' --views 3"
     """
     program, *given = sys.argv if arguments is None else arguments
-    return shlex.join([Path(program).name, *map(_shown, given)])
+    path = Path(program)
+    words = ["python", "-m", path.parent.name] if path.name == "__main__.py" else [path.name]
+    return shlex.join([*words, *map(_shown, given)])
 
 
 def versions(*more: str) -> dict[str, str]:

@@ -178,10 +178,6 @@ def _seen_by(view: DepthView, xyz: Tensor) -> tuple[Tensor, Tensor]:
 def _photo_pixels(frame: Frame, xyz: FloatArray) -> FloatArray:
     """Where the photo, lens and all, shows world points ``(N, 3)`` in front of it."""
     local = xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
-    if frame.lens is None:
-        pixels = local @ frame.K.T
-        flat: FloatArray = pixels[:, :2] / pixels[:, 2:]
-        return flat
     found: FloatArray = lens_of(frame).project(torch.from_numpy(local)).pixels.numpy()
     return found
 

@@ -209,9 +209,8 @@ def _of_photo(frame: Frame, depth: Tensor, std: Tensor, *, most: int) -> DepthVi
 def _of_own_camera(frame: Frame, depth: Tensor, std: Tensor) -> DepthView:
     """Depth at the pixels of a camera of its own, with the photo's colours where that sees it."""
     size = (depth.shape[0], depth.shape[1])
-    photo_K = torch.tensor(frame.K)
     if frame.depth_K is None:
-        K = resize_intrinsics(photo_K, old_size=frame.image_size, new_size=size)
+        K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
     else:
         K = torch.tensor(frame.depth_K)
     cam_from_depth = torch.eye(4, dtype=torch.float64)
@@ -223,10 +222,6 @@ def _of_own_camera(frame: Frame, depth: Tensor, std: Tensor) -> DepthView:
     depth, std = depth[every, every].contiguous(), std[every, every].contiguous()
     view = DepthView(depth, std, depth.new_zeros(*depth.shape, 3).byte(), _thinned(K, step), pose)
     points = view.points().double() @ cam_from_depth[:3, :3].T + cam_from_depth[:3, 3]
-    if frame.lens is None:
-        z = points[..., 2:].clamp_min(1e-9)
-        pixels = (points @ photo_K.T)[..., :2] / z
-    else:
-        pixels = lens_of(frame).project(points.reshape(-1, 3)).pixels.view(*depth.shape, 2)
-    photo = torch.from_numpy(frame.read_image().copy())
-    return view._replace(colors=nearest(photo, pixels))
+    pixels, seen = lens_of(frame).project(points.reshape(-1, 3))
+    colors = nearest(torch.from_numpy(frame.read_image().copy()), pixels) * seen[:, None]
+    return view._replace(colors=colors.view_as(points))

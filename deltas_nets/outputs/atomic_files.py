@@ -56,7 +56,8 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """
     _check_no_device(path)
     outer = sys.exception()
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.deltas-tmp")
+    # Not its whole name, which may be as long as names can be.
+    temporary = path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}.deltas-tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Not tempfile, whose files are private to the user: outputs follow the umask.

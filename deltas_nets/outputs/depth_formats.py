@@ -3,7 +3,8 @@
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Literal, NamedTuple
+from tokenize import TokenError
+from typing import IO, Any, Literal, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -130,12 +131,19 @@ DEPTH_FORMATS: dict[DepthFormatName, DepthFormat] = {
     "pfm": DepthFormat(_write_pfm, _read_pfm),
 }
 """By the suffix of their files."""
+_UNREADABLE = (
+    *(OSError, ValueError, KeyError, SyntaxError, EOFError, Image.DecompressionBombError),
+    *(BadZipFile, zlib.error, TokenError, RuntimeError, MemoryError),  # of an npz
+)
+"""What Pillow and NumPy raise where a file is damaged."""
 
 
-def _one_channel(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+def _one_channel(depth: NDArray[Any]) -> NDArray[np.float32]:
     if depth.ndim != 2 or depth.size == 0:
         raise ValueError(f"its shape must be (H, W), got {depth.shape}")
-    return depth
+    if depth.dtype.kind not in "fiu":
+        raise ValueError(f"it must hold numbers, got {depth.dtype}")
+    return depth.astype(np.float32, copy=False)
 
 
 def read_depth_map(
@@ -163,7 +171,7 @@ def read_depth_map(
         raise UserError(f"a frame has several depth maps, {names}", file.parent, "keep one of them")
     try:
         return _one_channel(kind.read(file, scale))
-    except (OSError, ValueError, KeyError, SyntaxError, BadZipFile, EOFError) as error:
+    except _UNREADABLE as error:
         what = f"the depth map cannot be read ({error})"
         raise UserError(what, file, MAKE_ANEW if ours else THEIRS) from error
 

@@ -3,6 +3,7 @@
 import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from importlib.resources import files
 from statistics import mean
 from typing import Any, NamedTuple
@@ -258,10 +259,10 @@ def _short(number: float) -> str:
     """Two digits of a number, without an exponent.
 
     Example:
-        >>> _short(0.7134), _short(2.881), _short(124.7)
-        ('0.71', '2.9', '120')
+        >>> _short(0.7134), _short(2.881), _short(124.7), _short(1.23e6), _short(4.2e-6)
+        ('0.71', '2.9', '120', '1200000', '0.0000042')
     """
-    return f"{float(f'{number:.2g}'):g}"
+    return f"{Decimal(f'{number:.2g}'):f}"
 
 
 def _rounded(numbers: Sequence[float] | NDArray[np.float64]) -> list[float]:

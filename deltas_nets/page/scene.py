@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from deltas_geom import Lens
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.rigid import rigid_inverse
 from deltas_nets.captures.spread import spread
+from deltas_nets.captures.straight import lens_of
 from deltas_nets.page.maps import Maps, fused_in
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
 
@@ -29,7 +29,6 @@ MOST_POINTS, MOST_FACES = 200_000, 200_000
 """Of a page: 9 bytes a point and 15 a face, a third more in base64."""
 SURE = 0.5
 """Confidence from which points of maps are shown."""
-SMALLEST_DEPTH = 1e-9
 MAPS_OF_CLOUD, POINTS_OF_CLOUD = 120, 1_200_000
 """At most so many maps are read for their points, and so many points of all of them."""
 
@@ -148,18 +147,9 @@ def _confidence_at(points: NDArray[np.float64], maps: Maps, id: str) -> NDArray[
     frame = maps.capture.frame(id)
     local = points @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
     share = np.divide(confidence.shape, frame.image_size)[::-1]
-    pixels = (_pixels(local, frame) + 0.5) * share - 0.5
+    seen = lens_of(frame).project(torch.from_numpy(local)).pixels.numpy()
+    pixels = (seen + 0.5) * share - 0.5
     limits = np.array(confidence.shape)[::-1] - 1
     column, row = np.rint(pixels).clip(0, limits).astype(int).T
     there: NDArray[np.float32] = confidence[row, column]
     return there
-
-
-def _pixels(local: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
-    """``(N, 2)`` of points ahead of the camera, in the image file."""
-    if frame.lens is None:
-        return (local @ frame.K[:2].T) / np.maximum(local[:, 2:], SMALLEST_DEPTH)
-    coefficients = torch.tensor(frame.lens.coefficients, dtype=torch.float64)
-    lens = Lens(torch.from_numpy(frame.K.copy()), coefficients, frame.lens.model)
-    pixels: NDArray[np.float64] = lens.project(torch.from_numpy(local)).pixels.numpy()
-    return pixels

@@ -1,5 +1,6 @@
 """Meshes and clouds: read from PLY files, and made small enough to be shown."""
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,18 +48,24 @@ def read_surface(path: Path) -> Surface:
     vertices = read_points(path)
     content = path.read_bytes()
     header = content[: content.find(b"end_header")].decode("ascii", "replace")
-    elements = [line.split() for line in header.splitlines() if line.startswith("element")]
-    count = next((int(words[2]) for words in elements if words[1:2] == ["face"]), 0)
+    elements = [line.split()[1:] for line in header.splitlines() if line.startswith("element")]
+    stated = {words[0]: words[1] for words in elements if len(words) == 2}
     rgb = vertices.rgb
-    if "property uchar red" not in header:
+    if not re.search(r"property (uchar|uint8) red\b", header):
         rgb = np.full_like(rgb, PLAIN)
+    faces_stated = stated.get("face", "0")
+    count = int(faces_stated) if re.fullmatch("[0-9]{1,11}", faces_stated) else -1
     if count == 0:
         return Surface(vertices.xyz, rgb)
     form = "write triangles as binary little-endian PLY: list uchar int vertex_indices"
-    known = "format binary_little_endian" in header and elements[-1][1] == "face"
-    if not known or len(content) < count * _CORNERS.itemsize:
+    known = "format binary_little_endian" in header and elements[-1][:1] == ["face"]
+    if not known or not 0 < count * _CORNERS.itemsize <= len(content):
         raise UserError("the faces cannot be read", path, form)
-    table = np.frombuffer(content[-count * _CORNERS.itemsize :], dtype=_CORNERS)
+    if len(vertices.xyz) != int(stated["vertex"]):
+        what = "the faces cannot be read: some of the vertices are not finite"
+        raise UserError(what, path, "write the mesh without those")
+    start = len(content) - count * _CORNERS.itemsize
+    table = np.frombuffer(content, _CORNERS, count, start)
     faces = table["corners"].astype(np.int64)
     if (table["count"] != 3).any() or faces.min() < 0 or faces.max() >= len(vertices.xyz):
         raise UserError("the faces are not triangles of the file's vertices", path, form)

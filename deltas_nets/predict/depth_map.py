@@ -9,10 +9,11 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from deltas_geom import PosedViews, unproject
+from deltas_geom import unproject
 from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.captures.work_size import camera_at
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.prediction import DepthPrediction
 
@@ -159,11 +160,8 @@ def point_cloud(
     step = max(1, round(size[0] / work_size[0]))
     rows, columns = np.mgrid[step // 2 : size[0] : step, step // 2 : size[1] : step].reshape(2, -1)
     z = torch.from_numpy(depth[rows, columns]).double()
-    view = PosedViews(
-        torch.tensor(anchor.K)[None], torch.tensor(anchor.cam_from_world)[None]
-    ).resize(old_size=anchor.image_size, new_size=size)
     pixels = torch.from_numpy(np.stack([columns, rows], axis=-1)).double()
-    points = unproject(view, pixels[None], z[None])[0]
+    points = unproject(camera_at(anchor, size), pixels[None], z[None])[0]
     colors = anchor.read_resized(size)[rows, columns]
     known = z.numpy() > 0
     in_world: NDArray[np.float64] = points.numpy()[known]

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom import PosedViews
-from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.compared import Described, compared
 from deltas_nets.captures.capture import Frame
+from deltas_nets.captures.work_size import camera_at
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.encoded_frames import EncodedFrames
 
@@ -61,11 +60,9 @@ class DescribedFrames:
         Raises:
             UserError: the image cannot be read.
         """
-        frame, maps = seen.frame, self._maps(seen)
+        maps = self._maps(seen)
         size = (maps.shape[0], maps.shape[1])
-        K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
-        view = PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
-        return Described(maps.flatten(0, 1).float() / STEPS, size, view)
+        return Described(maps.flatten(0, 1).float() / STEPS, size, camera_at(seen.frame, size))
 
     def _maps(self, seen: AtSize) -> Tensor:
         """``(h, w, D)`` in steps."""

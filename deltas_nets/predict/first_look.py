@@ -6,18 +6,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.known_depths import points_in_view
 from deltas_nets.captures.measured import measured_by_hand
 from deltas_nets.captures.spread import spread
+from deltas_nets.captures.straight import lens_of
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.work_size import depth_at_image
 from deltas_nets.captures.working_depth import guessed_depth, knows_its_scale, working_depths
 from deltas_nets.check.workers import side_by_side
 from deltas_nets.errors import UserError
+from deltas_nets.fuse.depth_view import nearest
 from deltas_nets.network.unit import AS_IN_ROOMS
 from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.look import found_depths
@@ -250,12 +253,10 @@ def _ratios_at_points(capture: Capture, position: int) -> FloatArray:
     points, frame = points_in_view(capture, position), capture.frames.at(position)
     if points is None:
         return np.zeros(0)
-    measured = depth_at_image(frame)
-    x, y, w = (points @ frame.K.T).T
-    column, row = np.rint(x / w).astype(int), np.rint(y / w).astype(int)
-    inside = (column >= 0) & (column < measured.shape[1]) & (row >= 0) & (row < measured.shape[0])
-    at = measured[row[inside], column[inside]]
-    ratios: FloatArray = (at / points[inside, 2])[at > 0]
+    pixels, seen = lens_of(frame).project(torch.from_numpy(points))
+    measured = nearest(torch.from_numpy(depth_at_image(frame)), pixels) * seen
+    known = measured.numpy() > 0
+    ratios: FloatArray = measured.numpy()[known] / points[known, 2]
     return ratios
 
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import torch
 
 from deltas_geom import PosedViews
-from deltas_geom.cameras.pixels import resize_intrinsics
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.held import held
@@ -17,6 +16,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.spread import spread
 from deltas_nets.captures.straight import straight
+from deltas_nets.captures.work_size import camera_at
 from deltas_nets.errors import UserError
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.unit import unit_of
@@ -151,11 +151,8 @@ class LaterPasses:
             what = f"a map of frame {id} from an earlier pass is gone or damaged"
             raise UserError(what, told.file(id), "run the same command again")
         found, record = read
-        frame = straight(self.capture.frame(id))
         size = (found.depth.shape[-2], found.depth.shape[-1])
-        K = resize_intrinsics(torch.tensor(frame.K), old_size=frame.image_size, new_size=size)
-        view = PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
-        return _First(found, view, record)
+        return _First(found, camera_at(straight(self.capture.frame(id)), size), record)
 
 
 def _by_size(heard: Sequence[_First]) -> list[Heard]:

@@ -38,6 +38,11 @@ def test_the_content_is_on_the_disk_before_its_name_and_the_name_at_the_end(
     assert events == ["file of 10 bytes", "renamed to a.bin", "folder"]
 
 
+def test_a_name_may_be_as_long_as_names_can_be(tmp_path: Path) -> None:
+    write_json(tmp_path / ("é" * 125 + ".json"), {"a": 1})
+    assert [len(os.fsencode(file.name)) for file in tmp_path.iterdir()] == [255]
+
+
 def test_a_folder_that_cannot_be_synced_is_none_the_worse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

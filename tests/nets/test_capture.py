@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from PIL import Image
 from small_capture import K_FILE
 
-from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.capture import Capture, Frame, Lost
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.readers.poses import world_from_cam_inverse
 from deltas_nets.errors import UserError
 
@@ -29,6 +31,23 @@ def test_frames_come_in_the_order_of_their_numbers(make_capture: MakeCapture) ->
     capture = open_capture(make_capture(num_frames=11))
     assert list(capture.frames) == list(map(str, range(11)))
     assert capture.lost == {}
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3)), max_size=20), st.integers(0, 2**4 - 1)
+)
+def test_each_frame_knows_the_points_that_it_sees(seen: list[tuple[int, int]], kept: int) -> None:
+    table = np.array(seen, dtype=np.int64).reshape(-1, 2)
+    observed = Observations(table[:, 0], table[:, 1], np.zeros((len(seen), 2)))
+    points = SparsePoints(np.zeros((10, 3)), np.zeros((10, 3), np.uint8), np.zeros(10), observed)
+    frames = [Frame(str(id), Path(), (4, 4), np.eye(3), np.eye(4)) for id in range(4)]
+    capture = Capture(Path(), Frames.of(frames, Path()), {}, points=points)
+    found = [points.tolist() for points in capture.points_of_frame]
+    assert found == [[point for point, place in seen if place == frame] for frame in range(4)]
+    mask = np.array([bool(kept >> frame & 1) for frame in range(4)])
+    fewer = capture.without(mask, Lost("no depth", UserError("it has none", Path(), "go on")))
+    left = [points for points, gone in zip(found, mask, strict=True) if not gone]
+    assert [points.tolist() for points in fewer.points_of_frame][: len(left)] == left
 
 
 def test_poses_are_inverted(capture: Capture) -> None:

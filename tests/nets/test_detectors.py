@@ -1,6 +1,7 @@
 """Detectors beside each other: what counts as a point, a match, a right pose; table and record."""
 
 import math
+import weakref
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,24 +20,36 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from deltas_geom import PosedViews
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import save_capture
+from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config import DetectorConfig, NetworkConfig
 from deltas_nets.distill.superpoint import SuperPoint
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.detectors.aliked import AlikedExtractor
+from deltas_nets.evaluate.detectors.capture import pairs_of, score_capture
 from deltas_nets.evaluate.detectors.classical import orb, sift
+from deltas_nets.evaluate.detectors.config import TableConfig
 from deltas_nets.evaluate.detectors.dense import disk, superpoint
 from deltas_nets.evaluate.detectors.features import DetectionConfig, Features, thinned
 from deltas_nets.evaluate.detectors.matched import mutual_nearest
 from deltas_nets.evaluate.detectors.own import ours
 from deltas_nets.evaluate.detectors.pairs_file import read_pairs
 from deltas_nets.evaluate.detectors.pose.consensus import ConsensusConfig
-from deltas_nets.evaluate.detectors.registry import load_extractors
+from deltas_nets.evaluate.detectors.registry import (
+    CHANCE,
+    NamedExtractor,
+    load_extractors,
+    spread,
+)
 from deltas_nets.evaluate.detectors.scores import pool, score_pair
 from deltas_nets.evaluate.record import read_record
 from deltas_nets.evaluate.some_sets import evenly_spaced
 from deltas_nets.network.deltas import Deltas
+from deltas_nets.network.lite.detector import spread_points
 from deltas_nets.rooms.textures import load_picture
 from deltas_nets.weights_file import save_weights
 
@@ -275,6 +288,36 @@ def test_the_command_prints_the_table_and_keeps_what_made_it(
     assert str(tmp_path) not in file.read_text()
 
 
+def test_of_images_with_a_lens_the_first_is_named() -> None:
+    lens, place = Lens("SIMPLE_RADIAL", (0.1,)), Path("depth.png")
+    frames = [
+        Frame(str(id), Path(f"{id}.jpg"), (4, 4), np.eye(3), np.eye(4), place, lens=lens)
+        for id in range(30)
+    ]
+    capture = Capture(Path(), Frames.of(frames, Path()), {})
+    views = [ViewSet(str(id), (str(id - 1),)) for id in range(29, 0, -1)]
+    with pytest.raises(UserError) as error:
+        pairs_of(capture, views)
+    assert error.value.where == Path("29.jpg")
+
+
+def test_what_no_later_pair_needs_is_forgotten(tmp_path: Path) -> None:
+    capture = open_capture(write_capture(tmp_path / "walk", 8, image_size=(48, 64)))
+    alive: weakref.WeakSet[Tensor] = weakref.WeakSet()
+    most = []
+
+    def extract(image: Tensor, config: DetectionConfig) -> Features:
+        found = spread(image, config)
+        alive.add(found.descriptors)
+        most.append(len(alive))
+        return found
+
+    pairs = [(str(id), str(id + 1)) for id in range(7)]
+    scores = score_capture([NamedExtractor("spread", extract, {})], capture, pairs, TableConfig())
+    assert len(most) == 8 and max(most) <= 3
+    assert scores["spread"].points == len(spread_points(CHANCE, image_size=(48, 64)))
+
+
 def test_the_command_reads_pairs_without_depth(run: Run, tmp_path: Path) -> None:
     capture = write_capture(tmp_path / "capture", 2, image_size=SIZE)
     K = "128 0 63.5 0 128 47.5 0 0 1"
@@ -289,6 +332,8 @@ def test_the_command_reads_pairs_without_depth(run: Run, tmp_path: Path) -> None
         (line.replace("0.jpg", "9.jpg"), "no image 9.jpg"),
         (line.replace(" 0 0 128", " 1 0 128", 1), "rotated images"),
         (line.replace("128", "f", 1), "no number"),
+        (line.replace("-0.15", "nan", 1), "no number"),
+        (line.replace("128", "1e999", 1), "no number"),
         ("", "no pairs"),
     ):
         file.write_text(wrong)

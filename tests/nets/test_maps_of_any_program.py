@@ -1,5 +1,6 @@
 """Maps that another program wrote, scored: what is not as it has to be is told, not scored."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import pytest
 from PIL import Image
 from run_command import Result, Run, assert_one_line
 from small_capture import write_capture
+
+from deltas_nets.errors import UserError
+from deltas_nets.outputs.depth_formats import read_depth_map
 
 Score = Callable[[], Result]
 DEPTH = np.full((48, 64), 2.5, np.float32)  # m, as the capture's
@@ -45,6 +49,26 @@ def test_a_frame_has_one_map(maps: Path, score: Score) -> None:
     np.savez(maps / "1.npz", depth=DEPTH)
     Image.fromarray(1000 * STEPS).save(maps / "1.png")
     assert_one_line(score(), "a frame has several depth maps, 1.png and 1.npz")
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float64, np.uint16])
+def test_a_map_of_numbers_of_another_type_is_read_as_float32(maps: Path, kind: type) -> None:
+    np.savez(maps / "1.npz", depth=(4 * DEPTH).astype(kind))
+    found = read_depth_map(maps.parent, "1", 1000.0, ours=False)
+    assert found.dtype == np.float32 and np.array_equal(found, 4 * DEPTH)
+
+
+def test_words_and_damaged_files_are_no_maps(maps: Path) -> None:
+    file = maps / "1.npz"
+    np.savez(file, depth=np.full((48, 64), "far"))
+    with pytest.raises(UserError, match="it must hold numbers"):
+        read_depth_map(maps.parent, "1", 1000.0)
+    np.savez_compressed(file, depth=np.random.default_rng(0).random((12, 16), np.float32))
+    whole = file.read_bytes()
+    for place in range(0, len(whole), 11):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        with contextlib.suppress(UserError):
+            read_depth_map(maps.parent, "1", 1000.0)
 
 
 @pytest.mark.parametrize("factor", [1000, 0.001])

@@ -122,6 +122,38 @@ def test_a_mesh_that_is_cut_short_is_refused(tmp_path: Path, cut: int) -> None:
     assert error.value.where == file
 
 
+def _changed(folder: Path, *changes: tuple[bytes, bytes]) -> Path:
+    mesh_of(folder)
+    file = folder / "mesh.ply"
+    data = file.read_bytes()
+    for old, new in changes:
+        assert old in data
+        data = data.replace(old, new, 1)
+    file.write_bytes(data)
+    return file
+
+
+def test_colours_of_either_name_of_a_byte_are_shown(tmp_path: Path) -> None:
+    names = (b"red", b"green", b"blue")
+    changes = [(b"uchar " + name, b"uint8 " + name) for name in names]
+    read = read_surface(_changed(tmp_path, *changes))
+    np.testing.assert_array_equal(read.rgb, mesh_of(tmp_path).rgb)
+
+
+FAULTS = {
+    "a vertex that is not finite": (b"end_header\n" + bytes(4), b"end_header\n\x00\x00\xc0\x7f"),
+    "a number of faces in words": (b"element face 3042", b"element face many"),
+    "fewer than no faces": (b"element face 3042", b"element face -3042"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_mesh_that_is_damaged_is_refused(tmp_path: Path, fault: str) -> None:
+    file = _changed(tmp_path, FAULTS[fault])
+    with pytest.raises(UserError, match="the faces cannot be read"):
+        read_surface(file)
+
+
 # Budget
 
 

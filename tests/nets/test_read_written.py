@@ -3,6 +3,7 @@
 import contextlib
 import os
 import struct
+import sys
 import time
 import tracemalloc
 import zlib
@@ -60,6 +61,16 @@ def test_polycams_images_stand_in_for_corrected_ones_with_a_warning(
     assert len(capture.frames) == NUM and "corrected_images is missing" in capture.doubts[-1]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux alone")
+def test_polycams_names_that_are_no_text_are_told(scene: Scene, tmp_path: Path) -> None:
+    folder = ALL["Polycam"](tmp_path / "scan", scene).path
+    first = min(path.stem for path in folder.rglob("*.json"))
+    for file in list(folder.rglob(f"{first}.*")):
+        file.rename(file.with_name(os.fsdecode(b"a\xff") + file.suffix))
+    with pytest.raises(UserError, match="an image cannot be called"):
+        open_capture(folder)
+
+
 def test_points_and_their_observations_are_read(scene: Scene, tmp_path: Path) -> None:
     for layout, pixels in {
         "OpenSfM": [[47.5, 15.5]],
@@ -92,6 +103,18 @@ def test_tum_without_a_camera_names_the_option(scene: Scene, tmp_path: Path) -> 
     with pytest.raises(UserError) as error:
         open_capture(tmp_path / "walk")
     assert "--intrinsics freiburg1" in error.value.remedy
+
+
+def test_tum_without_poses_says_so_whether_its_camera_is_known_or_not(
+    scene: Scene, tmp_path: Path
+) -> None:
+    for name in ("freiburg1", "walk"):
+        folder = tum(tmp_path / name, scene).path
+        for file in ("intrinsics.txt", "groundtruth.txt"):
+            (folder / file).unlink()
+        with pytest.raises(UserError) as error:
+            open_capture(folder)
+        assert "permissions" not in error.value.remedy
 
 
 def test_tum_says_what_is_missing_and_does_not_guess_poses(scene: Scene, tmp_path: Path) -> None:
@@ -191,6 +214,16 @@ def test_a_million_lines_take_seconds(scene: Scene, tmp_path: Path) -> None:
     start = time.process_time()
     assert len(open_capture(folder).frames) == NUM
     assert time.process_time() - start < 30
+
+
+@pytest.mark.parametrize("unknown", [0, -np.inf, np.inf, np.nan])
+def test_a_sens_that_knows_no_place_of_its_cameras_raises_no_doubt(
+    unknown: float, scene: Scene, tmp_path: Path
+) -> None:
+    file = ALL[".sens"](tmp_path / "capture", scene).path
+    data, known = file.read_bytes(), np.eye(4, dtype="<f4").tobytes()
+    file.write_bytes(data.replace(known, np.full((4, 4), unknown, "<f4").tobytes(), 2))
+    assert not open_capture(file).doubts
 
 
 def _sens_bomb(written: Written) -> None:

@@ -41,6 +41,11 @@ def test_the_command_names_no_folder_of_the_machine() -> None:
     assert said == "deltas detectors walk sift=y.pth runs/w.pth"
 
 
+def test_the_command_of_a_module_names_the_module() -> None:
+    said = command_line(["/a/site-packages/deltas_nets/__main__.py", "evaluate", "walk"])
+    assert said == "python -m deltas_nets evaluate walk"
+
+
 def test_a_shell_reads_the_command_as_it_was_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

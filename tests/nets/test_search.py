@@ -9,14 +9,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import Frame
+from deltas_nets.captures.frame import Frame, Lens
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.keyframes import keyframes
 from deltas_nets.captures.known_depths import farthest_depth, points_in_view
 from deltas_nets.captures.points import Observations, SparsePoints
 from deltas_nets.captures.scaled import scaled
+from deltas_nets.captures.straight import lens_of
 from deltas_nets.captures.view_choice import choose_view_sets
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.working_depth import (
@@ -238,6 +240,21 @@ def test_the_scale_is_found_by_sensor_and_by_hand(capture: Capture, tmp_path: Pa
         scale_by_measurements(Blind(2.5), small, config, file)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="no sensor depth"):
         scale_by_sensor(oracle, no_sensor(small), config)  # type: ignore[arg-type]
+
+
+def test_the_scale_by_points_is_read_where_a_lens_shows_them(capture: Capture) -> None:
+    frame, bent = capture.frame("1"), Lens("SIMPLE_RADIAL", (0.5,))
+    assert frame.depth_path is not None
+    steps = np.tile(1000 + 100 * np.arange(64, dtype=np.uint16), (48, 1))
+    Image.fromarray(steps).save(frame.depth_path)
+    frame = replace(frame, lens=bent, depth_K=None, cam_from_world=np.eye(4))
+    pixels = torch.cartesian_prod(torch.arange(40, 60, 2), torch.arange(10, 40, 3)).double()
+    rays = lens_of(frame).unproject(pixels).rays
+    xyz = 0.1 * (1 + 0.1 * pixels[:, :1]) * rays / rays[:, 2:]
+    seen = Observations(np.arange(len(xyz)), np.zeros(len(xyz), np.int64), pixels.numpy())
+    points = SparsePoints(xyz.numpy(), np.zeros((len(xyz), 3), np.uint8), xyz[:, 0].numpy(), seen)
+    small = replace(capture, frames=Frames.of([frame]), points=points, metric=False)
+    assert scale_by_sensor(Oracle(99.0), small, PredictConfig()) == pytest.approx(10)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("written", [{"size": (32, 40)}, {"min_confidence": 1.0}])

@@ -229,6 +229,24 @@ def test_a_table_that_was_stopped_goes_on_and_measures_nothing_twice(
     assert (tmp_path / "out" / "ratio.png").stat().st_size > 5000
 
 
+def test_networks_whose_files_are_called_alike_are_told_apart(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stub:
+        def weights_record(self, name: str) -> dict[str, str]:
+            return {"name": name, "sha256": name}
+
+    monkeypatch.setattr(measuring, "load_predictor", lambda *_: Stub())
+    monkeypatch.setattr(measuring, "_row", lambda *_: {"abs_rel": 0.1})
+    networks = ["/there/a/run/w.safetensors", "/there/b/run/w.safetensors", "deltas-small"]
+    series = Series("one", "one", "", (Step("as it is"),))
+    base = measuring.Measurement(capture, (ViewSet("1", ("0",)),), PredictConfig())
+    found = measuring.measure(series, networks, base, Journal(tmp_path / "rows.jsonl"))
+    shown = ["a/run/w.safetensors", "b/run/w.safetensors", "deltas-small"]
+    assert [row["weights"] for row in found.rows] == shown == list(found.weights)
+    assert [record["name"] for record in found.weights.values()] == shown
+
+
 def test_nothing_is_written_among_the_files_of_a_capture(run: Run, tmp_path: Path) -> None:
     where = write_capture(tmp_path / "walk", 3)
     before = sorted(where.rglob("*"))

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from small_capture import write_capture
 
-from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.capture import Capture, Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.protocols.deep_video import (
@@ -118,6 +119,17 @@ def test_a_rule_is_recorded_by_name_and_version(walk: Capture) -> None:
     }
     assert ViewProtocol("deepvideomvs").of(walk).record["views"] == 3
     assert ViewProtocol(views=2).of(walk).record == {"name": "chosen", "version": 1, "views": 2}
+
+
+def test_ids_may_be_nanoseconds_and_not_more() -> None:
+    def at(first: int) -> Capture:
+        ids = (str(first + step) for step in range(4))
+        frames = [Frame(id, Path(), (4, 4), np.eye(3), np.eye(4)) for id in ids]
+        return Capture(Path("walk"), Frames.of(frames, Path()), {})
+
+    assert len(fixed_gap_view_sets(at(2**63 - 4), 3, gap=1, every=1)) == 2
+    with pytest.raises(UserError, match="frames without numbers"):
+        fixed_gap_view_sets(at(2**63 - 3), 3, gap=1, every=1)
 
 
 def test_what_has_no_sequence_is_refused(walk: Capture, tmp_path: Path) -> None:

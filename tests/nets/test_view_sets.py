@@ -62,6 +62,12 @@ def test_a_file_that_is_missing_or_binary_is_one_line(capture: Capture, tmp_path
         assert error.value.where == file and error.value.remedy
 
 
+@pytest.mark.parametrize("form", ["utf-8-sig", "utf-16"])
+def test_a_file_may_say_how_its_text_is_coded(capture: Capture, tmp_path: Path, form: str) -> None:
+    (tmp_path / "sets.json").write_bytes('[{"anchor": 2, "sources": [1]}]'.encode(form))
+    assert read_view_sets(tmp_path / "sets.json", capture) == (ViewSet("2", ("1",)),)
+
+
 def test_a_set_that_names_a_lost_pose_is_an_error(make_capture: MakeCapture) -> None:
     folder = make_capture()
     (folder / "pose" / "1.txt").write_text("nan " * 16)
@@ -142,6 +148,14 @@ def test_of_a_camera_that_walks_ahead_a_source_is_near_enough_to_see_what_the_an
     first, second = map(int, chosen.sources)
     # By baseline alone the second would be farther than the first, and see less still.
     assert second < first
+
+
+def test_as_many_views_as_are_wanted_go_together() -> None:
+    ring = np.linspace(0, 2 * np.pi, 70, endpoint=False)
+    capture = row_of_cameras(0.3 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], axis=-1))
+    for wanted in (48, 49, 50, 60, 70, 80):
+        (chosen,) = choose_view_sets(capture, wanted, anchors=[0])
+        assert len(chosen.sources) == min(wanted - 1, 69)
 
 
 def test_a_camera_that_looks_elsewhere_is_not_chosen() -> None:

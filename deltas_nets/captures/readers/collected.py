@@ -11,6 +11,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.cameras import fitted
 from deltas_nets.captures.readers.image_sizes import SizedCamera, doubts_of_sizes
+from deltas_nets.captures.readers.names import check_ids
 from deltas_nets.captures.readers.poses import missing_images
 from deltas_nets.errors import UserError
 
@@ -115,7 +116,11 @@ class Collected:
             metric: whether its unit is the metre.
             doubts: besides those of sizes.
             form: how its files say cameras.
+
+        Raises:
+            UserError: no file of results can be called by one of the ids.
         """
+        check_ids([frame.id for frame in self._frames], self.listed)
         return Capture(
             folder,
             Frames.of(self._frames, folder),

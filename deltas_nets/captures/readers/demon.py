@@ -7,8 +7,8 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
-from deltas_nets.captures.images import image_size_of
 from deltas_nets.captures.readers.collected import Collected
+from deltas_nets.captures.readers.image_sizes import size_of_first
 from deltas_nets.captures.readers.intrinsics import read_intrinsics
 from deltas_nets.captures.readers.numbered import numbered_files
 from deltas_nets.captures.readers.poses import cam_from_world
@@ -31,8 +31,7 @@ def read(path: Path) -> Capture:
     rows = _rows(file)
     images = numbered_files(path, (".jpg", ".jpeg", ".png"))
     depths = numbered_files(path, (".npy",))
-    sizes = (image_size_of(image) for image in images.values())
-    K = read_intrinsics(path / "cam.txt", next((size for size in sizes if size), None))
+    K = read_intrinsics(path / "cam.txt", size_of_first(images.values()))
     found = Collected(path)
     for number in sorted(images.keys() | set(range(len(rows)))):
         id = f"{number:04d}"

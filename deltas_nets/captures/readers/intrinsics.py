@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.images import in_words
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
@@ -66,7 +67,7 @@ def doubtful_centre(K: FloatArray, image_size: tuple[int, int], path: Path) -> s
         return None
     return (
         f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is far from the middle of images of "
-        f"{_in_words(image_size)}, {path}: check that these intrinsics are theirs"
+        f"{in_words(image_size)}, {path}: check that these intrinsics are theirs"
     )
 
 
@@ -86,8 +87,8 @@ def _check_turned(K: FloatArray, image_size: tuple[int, int], path: Path) -> Non
     off_both_ways = right * down < 0 and min(abs(right), abs(down)) > CENTRAL
     if off_both_ways and max(map(abs, _from_middle(K, swapped))) < CENTRAL:
         what = (
-            f"images of {_in_words(image_size)} are rotated by 90 degrees: the principal point "
-            f"({K[0, 2]:g}, {K[1, 2]:g}) is of {_in_words(swapped)}"
+            f"images of {in_words(image_size)} are rotated by 90 degrees: the principal point "
+            f"({K[0, 2]:g}, {K[1, 2]:g}) is of {in_words(swapped)}"
         )
         raise UserError(what, path, "rotate the images back, or write intrinsics and poses of them")
 
@@ -106,10 +107,6 @@ def _check_resolution(K: FloatArray, image_size: tuple[int, int], path: Path) ->
     if outside or scaled:
         what = (
             f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) does not fit images of "
-            f"{_in_words(image_size)}: these intrinsics are of another resolution"
+            f"{in_words(image_size)}: these intrinsics are of another resolution"
         )
         raise UserError(what, path, "scale fx, fy, cx and cy to the images' size")
-
-
-def _in_words(image_size: tuple[int, int]) -> str:
-    return f"{image_size[1]}x{image_size[0]}"

@@ -23,7 +23,7 @@ __all__ = ["read", "recognises"]
 
 PLANES = 192
 """Depths that MVSNet tries where a file states the first and their distance only."""
-_CAMERAS = ("cams", "cams_1")
+_CAMERAS, _NUMBERED = ("cams", "cams_1"), ("_cam.txt",)
 _IMAGES = ("images", "blended_images", "image")
 _DEPTHS = ("rendered_depth_maps", "depths", "depth_gt")
 _SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -50,9 +50,11 @@ def read(path: Path) -> Capture:
     folder = _camera_folder(path)
     if folder is None:
         raise UserError("there is no camera 00000000_cam.txt", path / "cams", _REMEDY)
-    cameras = _numbered_cameras(folder)
-    images = next((files for name in _IMAGES if (files := _files(path / name, _SUFFIXES))), {})
-    depths = next((files for name in _DEPTHS if (files := _files(path / name, (".pfm",)))), {})
+    cameras = numbered_files(folder, _NUMBERED)
+    images, depths = (
+        next(filter(None, (numbered_files(path / name, suffixes) for name in names)), {})
+        for names, suffixes in ((_IMAGES, _SUFFIXES), (_DEPTHS, (".pfm",)))
+    )
     found = Collected(path)
     ranges: dict[str, tuple[float, float] | None] = {}
     rescaled: set[float] = set()
@@ -86,15 +88,7 @@ def read(path: Path) -> Capture:
 def _camera_folder(path: Path) -> Path | None:
     if not path.is_dir():
         return None
-    return next((path / name for name in _CAMERAS if _numbered_cameras(path / name)), None)
-
-
-def _numbered_cameras(folder: Path) -> dict[int, Path]:
-    return numbered_files(folder, ("_cam.txt",))
-
-
-def _files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    return numbered_files(folder, suffixes)
+    return next((path / name for name in _CAMERAS if numbered_files(path / name, _NUMBERED)), None)
 
 
 def _camera(path: Path) -> _Camera:

@@ -11,7 +11,8 @@ def numbered_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> d
 
     Args:
         folder: to list.
-        suffixes: in lower case, such as ``.color.png``, best first.
+        suffixes: in lower case, such as ``.color.png``, best first. Of several files of a number
+            and a suffix (``7.jpg``, ``007.jpg``), the first by name is taken.
         prefix: before the number.
     """
     if not folder.is_dir():
@@ -24,8 +25,6 @@ def numbered_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> d
             continue
         digits = name[len(prefix) : len(name) - len(suffix)]
         if digits.isascii() and digits.isdigit() and len(digits) < 19:
-            better = suffixes.index(suffix)
-            number = int(digits)
-            if number not in found or better < found[number][0]:
-                found[number] = better, path
+            number, candidate = int(digits), (suffixes.index(suffix), path)
+            found[number] = min(found.get(number, candidate), candidate)
     return {number: found[number][1] for number in sorted(found)}

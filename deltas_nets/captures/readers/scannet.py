@@ -1,6 +1,6 @@
 """ScanNet's export layout: color/N.jpg, depth/N.png, pose/N.txt, intrinsic/*.txt."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture, FloatArray, Frame, Lost
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of
+from deltas_nets.captures.readers.image_sizes import size_of_first
 from deltas_nets.captures.readers.intrinsics import doubtful_centre, read_intrinsics
 from deltas_nets.captures.readers.poses import world_from_cam_inverse
 from deltas_nets.captures.readers.refused import known_layout
@@ -140,14 +140,14 @@ def _find_files(scene: Path) -> _SceneFiles:
         remedy = "name each pose file like its image: pose/7.txt for color/7.jpg"
         raise UserError(what, scene / "pose", remedy)
 
-    image_size = _common_size(images.values())
+    image_size = size_of_first(images.values())
     if image_size is None:
         what = f"none of the {len(images)} images can be decoded"
         raise UserError(what, next(iter(images.values())), "copy the files again")
     file = scene / "intrinsic" / "intrinsic_color.txt"
     K = read_intrinsics(file, image_size)
     doubts = [_misnamed(scene / "color"), doubtful_centre(K, image_size, file)]
-    depth_size = _common_size(depths.values())
+    depth_size = size_of_first(depths.values())
     depth_K = None
     depth_file = scene / "intrinsic" / "intrinsic_depth.txt"
     # Registered depth often comes without a file of its own: None says "as the colour image".
@@ -227,13 +227,3 @@ def _other_shape(
         f"depth of {columns}x{rows} is taken to show what images of {width}x{height} show, for "
         f"there is no {missing}"
     )
-
-
-def _common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
-    """Size of the first readable image: one intrinsic file serves all, so they have one size.
-
-    Only one header is read: 2000 would take seconds on a network drive, and reading an image
-    checks its size against this one. A damaged first file is no obstacle while nobody needs it.
-    """
-    sizes = (image_size_of(path) for path in paths)
-    return next((size for size in sizes if size is not None), None)

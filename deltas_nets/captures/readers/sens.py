@@ -140,7 +140,7 @@ def _header(file: BinaryIO, path: Path) -> _Header:
     width, height, depth_width, depth_height = sides
     of_colour, colour_place, of_depth, depth_place = matrices
     # Not finite or zero where the writer knew none.
-    places = [place for place in (colour_place, depth_place) if np.abs(place).sum() > 0]
+    places = [place for place in (colour_place, depth_place) if 0 < np.abs(place).sum() < np.inf]
     return _Header(
         _intrinsics(of_colour, path),
         _intrinsics(of_depth, path),

@@ -33,7 +33,7 @@ from deltas_nets.captures.readers.names import (
     without_common_folder,
 )
 from deltas_nets.captures.readers.ply import read_points
-from deltas_nets.captures.readers.poses import world_from_cam_inverse
+from deltas_nets.captures.readers.poses import OPENGL, world_from_cam_inverse
 from deltas_nets.captures.readers.transforms_cameras import StatedCamera, stated_camera
 from deltas_nets.captures.readers.units import is_metric
 from deltas_nets.errors import UserError
@@ -48,8 +48,6 @@ DEPTHS = {
     "depth_path": "integer_depth_scale",  # instant-ngp's words for the same
 }
 """Keys of a frame's depth, and those of the root that say how long its steps are."""
-OPENGL = np.diag([1.0, -1, -1, 1])
-"""Its camera's axes from ours, and ours from its."""
 
 
 class _Entry(NamedTuple):
@@ -210,7 +208,7 @@ def _pose(entry: _Entry) -> FloatArray | Lost:
         return Lost("no pose", frame.error("has a transform_matrix that is not finite"))
     world_from_cam[:3, 3] /= scale
     try:
-        return world_from_cam_inverse(world_from_cam @ OPENGL, path=frame.path)
+        return world_from_cam_inverse(world_from_cam * OPENGL, path=frame.path)
     except UserError as error:
         what = f"{frame.where}: {error.what}"
         return Lost("not rigid", UserError(what, frame.path, error.remedy))

@@ -14,7 +14,8 @@ from deltas_nets.captures.camera_words import Intrinsics, named_camera
 from deltas_nets.captures.capture import Capture, Lost
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
-from deltas_nets.captures.images import image_size_of, in_words
+from deltas_nets.captures.images import in_words
+from deltas_nets.captures.readers.image_sizes import size_of_first
 from deltas_nets.captures.readers.names import frame_ids, without_common_folder
 from deltas_nets.captures.readers.poses import cam_from_world_of
 from deltas_nets.captures.readers.trajectory import GAP, Trajectory, nearest_stamps
@@ -66,8 +67,7 @@ def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
     if not images.names:
         what = f"none of the {images.missing} images of the list is there"
         raise UserError(what, path / "rgb.txt", "put them into the folder rgb")
-    sizes = (image_size_of(path / name) for name in images.names)
-    image_size = next((size for size in sizes if size is not None), None)
+    image_size = size_of_first(path / name for name in images.names)
     if image_size is None:
         raise UserError("no image can be decoded", path / images.names[0], "copy the files again")
     camera, said = _camera(path, image_size) if intrinsics is None else (intrinsics, "")
@@ -114,8 +114,8 @@ def _camera(path: Path, image_size: tuple[int, int]) -> tuple[Intrinsics, str]:
             text = read_text(path / name, name="intrinsics", remedy=remedy)
             lines = (line.partition("#")[0] for line in text.splitlines())
             return Intrinsics.parse(" ".join(lines), path / name), f", {name}"
-    heads = [_head(path / name) for name in ("rgb.txt", "groundtruth.txt")]
-    for words in (path.resolve().name, *heads):
+    lists = (path / name for name in ("rgb.txt", "groundtruth.txt"))
+    for words in (path.resolve().name, *(_head(file) for file in lists if file.is_file())):
         camera = named_camera(words)
         if camera is None:
             continue

@@ -9,6 +9,7 @@ from deltas_nets.captures.depth_files import MILLIMETRES, holds_floats
 from deltas_nets.captures.frame import Lens
 from deltas_nets.captures.ply_vertices import header_of, vertices_of
 from deltas_nets.captures.points import SparsePoints
+from deltas_nets.captures.readers.poses import OPENGL
 from deltas_nets.captures.writers.files import (
     PutDepth,
     Putting,
@@ -25,7 +26,6 @@ from deltas_nets.errors import UserError
 
 __all__ = ["write"]
 
-OPENGL = np.diag([1.0, -1, -1, 1])
 _NAMES = {
     "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
     "RADIAL": ("OPENCV", ("k1", "k2")),
@@ -88,7 +88,7 @@ def _frame(frame: Frame, folder: Path, putting: Putting, scale: float) -> dict[s
         "cx": float(frame.K[0, 2]) + 0.5,
         "cy": float(frame.K[1, 2]) + 0.5,
         **_lens(frame.lens, frame.image_path),
-        "transform_matrix": (np.linalg.inv(frame.cam_from_world) @ OPENGL).tolist(),
+        "transform_matrix": (np.linalg.inv(frame.cam_from_world) * OPENGL).tolist(),
     }
     depth = _put_depth(frame, folder / "depth" / frame.id, putting, scale)
     if depth is not None:

@@ -28,7 +28,7 @@ def pairs_of(capture: Capture, view_sets: Sequence[ViewSet]) -> list[tuple[str, 
     pairs = [p for p in pairs if all(capture.frame(id).depth_path is not None for id in p)]
     if not pairs:
         raise UserError("no two views with sensor depth", capture.path, "add depth/N.png")
-    for id in {id for pair in pairs for id in pair}:
+    for id in dict.fromkeys(id for pair in pairs for id in pair):
         if capture.frame(id).lens is not None:
             what = "detectors are compared on images without distortion"
             raise UserError(what, capture.frame(id).image_path, "name an undistorted capture")
@@ -61,7 +61,8 @@ def score_capture(
     )
     seen = _Seen(extractors, work_size, config)
     scored: dict[str, list[PairScores]] = {one.name: [] for one in extractors}
-    for pair in pairs:
+    last = {id: number for number, pair in enumerate(pairs) for id in pair}
+    for number, pair in enumerate(pairs):
         frames = [capture.frame(id) for id in pair]
         views = anchor_views(frames, work_size=work_size)
         depth = torch.stack([seen.depth(frame) for frame in frames])
@@ -77,12 +78,13 @@ def score_capture(
                     consensus=config.pnp,
                 )
             )
+        seen.forget([id for id in pair if last[id] == number])
         report(" ".join(pair))
     return {name: pool(scores, seen.mean_points(name)) for name, scores in scored.items()}
 
 
 class _Seen:
-    """Features and depth of frames, found once each."""
+    """Features and depth of frames, found once each and kept until they are not needed."""
 
     def __init__(
         self, extractors: Sequence[NamedExtractor], size: tuple[int, int], config: TableConfig
@@ -91,6 +93,7 @@ class _Seen:
         self._size, self._config = size, config
         self._features: dict[tuple[str, str], Features] = {}
         self._depth: dict[str, Tensor] = {}
+        self._points: dict[str, list[int]] = {one.name: [] for one in extractors}
 
     def features(self, name: str, frame: Frame) -> Features:
         """Of one detector on one frame."""
@@ -98,6 +101,7 @@ class _Seen:
         if key not in self._features:
             image = load_image(frame, work_size=self._size)
             self._features[key] = self._extractors[name](image, self._config.detection)
+            self._points[name].append(len(self._features[key].pixels))
         return self._features[key]
 
     def depth(self, frame: Frame) -> Tensor:
@@ -109,5 +113,11 @@ class _Seen:
 
     def mean_points(self, name: str) -> float:
         """In an image."""
-        counts = [len(found.pixels) for (of, _), found in self._features.items() if of == name]
-        return sum(counts) / len(counts)
+        return sum(self._points[name]) / len(self._points[name])
+
+    def forget(self, ids: Sequence[str]) -> None:
+        """Frames that no pair needs any more: a capture may have thousands."""
+        for id in set(ids):
+            self._depth.pop(id, None)
+            for name in self._extractors:
+                self._features.pop((name, id), None)

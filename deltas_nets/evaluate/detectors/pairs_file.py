@@ -93,6 +93,8 @@ def read_pairs(file: Path) -> list[ImagePair]:
             numbers = torch.tensor([float(word) for word in words[2:]], dtype=torch.float64)
         except ValueError as error:
             raise UserError(f"no number ({error})", where, remedy) from None
+        if not bool(numbers.isfinite().all()):
+            raise UserError("no number (one is not finite)", where, remedy)
         if bool(numbers[:2].any()):
             raise UserError("rotated images are not read", where, "write 0 0 after the names")
         names = [_image(file.parent, name, where) for name in words[:2]]

@@ -1,5 +1,7 @@
 """The paper's sequences: so many frames at a fixed gap, the anchor in their middle."""
 
+import numpy as np
+
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.scannet import ScanNetConfig
@@ -36,13 +38,15 @@ def fixed_gap_view_sets(
     Raises:
         UserError: ids are no numbers, or no frame has all its sources.
     """
-    if not all(id.isascii() and id.isdigit() for id in capture.frames):
+    # Nanoseconds since 1970 are below 2^63.
+    if not all(id.isascii() and id.isdigit() and int(id) < 2**63 for id in capture.frames):
         what = "frames without numbers have no gap between them"
         raise UserError(what, capture.path, "use --protocol chosen, or name --view-sets")
     rule, frames = ByGap(gap, num_views), capture.frames
-    if len(set(frames.numbers.tolist())) < len(frames):
+    numbers = frames.numbers
+    if len(np.unique(numbers)) < len(frames):
         raise UserError("two frames have one number", capture.path, "use --protocol chosen")
-    anchors = [int(place) for place in rule.anchors(frames) if frames.numbers[place] % every == 0]
+    anchors = [int(place) for place in rule.anchors(frames) if numbers[place] % every == 0]
     if not anchors:
         what = f"no frame that {every} divides has {rule.in_words()}"
         raise UserError(what, capture.path, "use another --gap, --every or --views")
