@@ -14,10 +14,12 @@ from deltas_nets.captures.readers import tum
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.verdict import Checked
 from deltas_nets.check.words import report_lines
-from deltas_nets.commands import depth_telling
+from deltas_nets.commands import depth_telling, train
 from deltas_nets.commands.check import Check
 from deltas_nets.commands.command_line import parse
 from deltas_nets.commands.convert import Convert
+from deltas_nets.commands.recipe import Recipe
+from deltas_nets.commands.train import Train
 from deltas_nets.errors import UserError
 
 POSE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -151,3 +153,20 @@ def test_an_image_that_is_turned_is_told_to_be(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="rotated by 90 degrees") as error:
         open_capture(tmp_path).frames["2"].read_image()
     assert error.value.remedy.startswith("rotate it back")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "advised"),
+    [(["train", "--out", "x"], "--encoder none"), (["recipe", "night", "--out", "x"], "--init")],
+)
+def test_a_package_that_is_missing_is_told_with_an_option_that_the_command_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], advised: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "find_spec", lambda _: None)
+    command = parse(arguments, (Train, Recipe))
+    with pytest.raises(UserError, match="encoder is not installed") as error:
+        command.run()
+    words = error.value.remedy.partition("or use ")[2].split()
+    assert words[0] == advised.split()[0]
+    parse([*arguments, *words], (Train, Recipe))  # it is one of its options
