@@ -155,6 +155,9 @@ class Frame:
             if orientation_of(self.image_path, self.image_span) != 1:
                 what += "; its EXIF says that it is to be turned, which is not followed"
                 remedy = "turn the file as its EXIF says, or leave it out"
+            elif header.size == self.image_size[::-1]:
+                what += ": it is rotated by 90 degrees"
+                remedy = "rotate it back, or leave it out"
             raise UserError(what, self.image_path, remedy)
 
     def _depth_path(self) -> Path:

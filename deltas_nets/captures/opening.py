@@ -8,6 +8,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 from typing import Protocol, runtime_checkable
 
 from deltas_nets.captures.camera_words import Intrinsics
@@ -38,6 +39,8 @@ from deltas_nets.captures.readers import (
     tum,
 )
 from deltas_nets.captures.readers.colmap_folder import PLACES
+from deltas_nets.captures.readers.listed import listed
+from deltas_nets.captures.readers.names import IMAGE_SUFFIXES
 from deltas_nets.captures.readers.refused import refusal
 from deltas_nets.errors import UserError
 
@@ -179,7 +182,7 @@ def _part_of(path: Path) -> UserError | None:
             or ((folder == around or path.is_file()) and _has_images_of(folder, path))
         ):
             what = "this is a part of a capture, which is a folder around it"
-            return UserError(what, path, f"name {folder}")
+            return UserError(what, path, f"name {quote(str(folder))}")
     return None
 
 
@@ -235,10 +238,27 @@ def _usable(capture: Capture) -> Capture:
             error = next(iter(without_image.values())).error
             names = ids_in_words(without_image)
             what = f"no frame has a pose and an image; missing are those of {names}"
+            others = _called_otherwise(capture)
+            if others:
+                what += f"; photos that are there have other names ({ids_in_words(others, 2)})"
+                remedy = f"{error.remedy}; or give the photos the names that the capture has"
+                raise UserError(what, error.where, remedy)
             raise UserError(what, error.where, error.remedy)
         raise _without_poses(capture)
     _check_images(capture)
     return capture
+
+
+def _called_otherwise(capture: Capture) -> list[str]:
+    """Photos where a capture has its images, if none of them is called as a frame is."""
+    folder = capture.path if capture.path.is_dir() else capture.path.parent
+    for place in filter(Path.is_dir, (folder / "images", folder)):
+        names = sorted(file.name for file in listed(place, *IMAGE_SUFFIXES))
+        if names and not {Path(name).stem for name in names} & {
+            Path(id).name for id in capture.lost
+        }:
+            return names
+    return []
 
 
 def _without_poses(capture: Capture) -> UserError:

@@ -30,7 +30,10 @@ def other_quaternions(case: Case) -> Iterator[Suspect]:
                 other = next(name for name in ORDERS if name != order)
                 whose = "camera-to-world" if inverted else "world-to-camera"
                 what = f"{whose} quaternions as {order} fit: {found.in_words}"
-                cure = f"write quaternions as {other}: they are read so, and stand there as {order}"
+                cure = (
+                    f"write quaternions as {other}: they are read so, and stand there as {order}; "
+                    "or, of matrices, do so where quaternions become matrices"
+                )
                 yield Suspect(found, Finding(Fault.QUATERNION_ORDER, what, (), cure, "error", mend))
 
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from textwrap import wrap
 
 from deltas_nets.captures.ids import ids_in_words
-from deltas_nets.check.finding import Finding
 from deltas_nets.check.verdict import Checked
 
 __all__ = ["mended_in_words", "report_lines"]
@@ -13,24 +13,34 @@ __all__ = ["mended_in_words", "report_lines"]
 _WIDTH = 96
 
 
-def report_lines(checked: Checked, capture: Path) -> Iterator[str]:
-    """Lines to print: what is wrong, how that is known, what to do, and what was looked at."""
+def report_lines(checked: Checked, capture: Path, intrinsics: str | None = None) -> Iterator[str]:
+    """Lines to print: what is wrong, how that is known, what to do, and what was looked at.
+
+    Cures and commands are a line each, however long, as what is copied from two lines is two
+    commands to a shell.
+
+    Args:
+        checked: what was found.
+        capture: its path, as it was given.
+        intrinsics: those of ``--intrinsics``, without which some captures cannot be opened.
+    """
     for number, finding in enumerate(checked.findings, start=1):
         yield f"{number}. {finding.severity}: {finding.cause.value}"
         yield from _part("evidence", finding.evidence)
         if finding.frames:
             yield from _part("frames", ids_in_words(finding.frames, 20))
-        yield from _part("cure", cure_in_words(finding, capture))
+        yield _line("cure", finding.cure)
+        if finding.mend is not None:
+            yield _line("or", mending_command(capture, intrinsics))
         yield ""
     yield f"verdict: {checked.verdict}"
     yield figures_in_words(checked)
 
 
-def cure_in_words(finding: Finding, capture: Path) -> str:
-    """The cure, and the command that does it where there is one."""
-    if finding.mend is None:
-        return finding.cure
-    return f"{finding.cure}; or: deltas check {capture} --mend OUT"
+def mending_command(capture: Path, intrinsics: str | None) -> str:
+    """The command that mends what was found, as a shell takes it."""
+    stated = "" if intrinsics is None else f" --intrinsics {quote(intrinsics)}"
+    return f"deltas check {quote(str(capture))}{stated} --mend OUT"
 
 
 def figures_in_words(checked: Checked) -> str:
@@ -57,6 +67,10 @@ def mended_in_words(checked: Checked, out: Path) -> str:
     return f"mended: {out}" + (
         f"; {left} of {len(checked.findings)} findings are left" * (left > 0)
     )
+
+
+def _line(name: str, text: str) -> str:
+    return f"   {name + ':':10}{text}"
 
 
 def _part(name: str, text: str) -> list[str]:

@@ -88,7 +88,7 @@ class Check(Command):
                 checked = check_capture(
                     capture, network, known=found, threads=threads, report=report
                 )
-        for line in report_lines(checked, self.capture):
+        for line in report_lines(checked, self.capture, self.intrinsics):
             print(line)
         if self.json is not None:
             write_json(self.json, checked.in_json())

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -63,6 +64,7 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
     Raises:
         TypeError: a command's fields are no flags, as it was not made a dataclass.
     """
+    arguments = [_from_home(word) for word in arguments]
     for command in commands:
         if "__dataclass_fields__" not in vars(command):
             what = f"{command.__name__} in COMMANDS is no dataclass"
@@ -92,6 +94,17 @@ def parse(arguments: Sequence[str], commands: Commands) -> Command:
         what = shorten(what, 200, placeholder=" ...")
         _fail(UserError(what, "command line", _help_of(arguments, commands)))
     return asked
+
+
+def _from_home(word: str) -> str:
+    """A path that begins with ~, which a shell leaves as it is in quotes and after ``--out=``.
+
+    A folder that is really called so stays.
+    """
+    parts = re.fullmatch(r"((?:[\w.-]+=)*)(~(?:[/\\].*)?)", word, re.DOTALL)
+    if parts is None or os.path.lexists("~"):
+        return word
+    return parts[1] + os.path.expanduser(parts[2])
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """What `deltas depth` says and shows at its end."""
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from deltas_nets.errors import UserError
@@ -66,7 +67,8 @@ def show(capture: "Capture", out: Path, depth_range: tuple[float, float]) -> Non
     try:
         _write(capture, out, depth_range)
     except UserError as error:
-        warn(f"no page to look at is written: {error}; deltas page goes on from there")
+        command = _page_command(capture, out)
+        warn(f"no page to look at is written: {error}; {command} goes on from there")
 
 
 def show_fused(capture: "Capture", depths: Path, fused: Path) -> None:
@@ -83,7 +85,12 @@ def show_fused(capture: "Capture", depths: Path, fused: Path) -> None:
     try:
         _write(capture, depths, depth_range, fused)
     except UserError as error:
-        warn(f"the page is as it was: {error}; deltas page --fused {fused} goes on from there")
+        command = f"{_page_command(capture, depths)} --fused {quote(str(fused))}"
+        warn(f"the page is as it was: {error}; {command} goes on from there")
+
+
+def _page_command(capture: "Capture", depths: Path) -> str:
+    return f"deltas page {quote(str(capture.path))} {quote(str(depths))}"
 
 
 def _write(

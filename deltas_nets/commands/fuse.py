@@ -162,7 +162,9 @@ class Fuse(Command):
                 "by other maps"
             )
         if fused.doubt is not None:
-            warn(fused.doubt)
+            # What is asked for by other options is another mesh, in place of this one.
+            there = any(file.parent != self.depths for file in fused.files)
+            warn(fused.doubt + there * f"; with --overwrite in {fused.files[0].parent}")
 
 
 def fuse_maps(

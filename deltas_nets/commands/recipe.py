@@ -74,7 +74,9 @@ class Recipe(Command):
             raise UserError(what, "command line", "use night")
         workers = self._workers()
         init = None if self.init is None else weights_file(self.init)
-        encoder = encoder_file("pretrained", "lite") if init is None else None
+        encoder = None
+        if init is None:
+            encoder = encoder_file("pretrained", "lite", otherwise="--init deltas-small")
         # Looked into before the folder remembers what it was begun with.
         if init is not None:
             load_model(init)

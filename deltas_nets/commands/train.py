@@ -176,8 +176,13 @@ def value_of(option: str, arguments: Sequence[str]) -> str | None:
     return value
 
 
-def encoder_file(name: str, backbone: str) -> Path | None:
+def encoder_file(name: str, backbone: str, *, otherwise: str = "--encoder none") -> Path | None:
     """The file of ``--encoder``: the one named, none, or that of the backbone's package.
+
+    Args:
+        name: what ``--encoder`` says.
+        backbone: the encoder that it is for.
+        otherwise: the option of the command that needs no package.
 
     Raises:
         UserError: the package is not installed.
@@ -191,8 +196,8 @@ def encoder_file(name: str, backbone: str) -> Path | None:
     if package is None or package.origin is None:
         raise UserError(
             "the pretrained encoder is not installed",
-            "--encoder pretrained",
-            'pip install "deltas-depth[train]", or use --encoder none',
+            wanted,
+            f'pip install "deltas-depth[train]", or use {otherwise}',
         )
     (file,) = (Path(package.origin).parent / "models").glob("*.pth")
     return file

@@ -235,6 +235,7 @@ def test_voxels_as_large_as_the_scene_are_named(
     assert_one_line(run(*arguments, 100, "--mesh"), "voxels of 100", "--voxel 0.03 shows more")
     few = run(*arguments, 0.3)
     assert few.code == 0 and "little was made" in few.warnings[0] and "--voxel" in few.warnings[0]
+    assert few.warnings[0].endswith(f"with --overwrite in {tmp_path / 'out'}")
 
 
 def test_maps_that_can_never_agree_are_refused(

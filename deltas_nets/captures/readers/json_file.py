@@ -17,6 +17,7 @@ __all__ = ["Fields", "read_json"]
 JSON_LIMIT = 256 * 2**20
 """Bytes. Python takes ten times as much to hold what a file says."""
 _LARGE = 2**63
+WITHOUT_QUOTES = 'write numbers without quotes: 0.5, not "0.5"'
 
 
 def read_json(path: Path, *, name: str, remedy: str, limit: int = JSON_LIMIT) -> object:
@@ -192,7 +193,8 @@ class Fields:
         if array is None:
             form = " x ".join("any" if size < 0 else str(size) for size in shape)
             wanted = f"{form} numbers" if shape else "a number"
-            raise self.error(f"has a {key} that is not {wanted}", key)
+            what = f"{self.where_of(key)} has a {key} that is not {wanted}"
+            raise UserError(what, self.path, WITHOUT_QUOTES if _quoted(found) else self.remedy)
         if finite and not np.isfinite(array).all():
             raise self.error(f"has a {key} that is not finite", key)
         return array
@@ -216,3 +218,13 @@ def _all_numbers(found: object, depth: int) -> bool:
     if depth:
         return isinstance(found, list) and all(_all_numbers(item, depth - 1) for item in found)
     return isinstance(found, int | float) and not isinstance(found, bool)
+
+
+def _quoted(found: object) -> bool:
+    """Whether a number stands there as text."""
+    if isinstance(found, list):
+        return any(map(_quoted, found))
+    try:
+        return isinstance(found, str) and math.isfinite(float(found))
+    except ValueError:
+        return False

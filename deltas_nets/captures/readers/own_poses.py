@@ -11,6 +11,10 @@ from deltas_nets.errors import UserError
 
 __all__ = ["matrix_of", "pose_of"]
 
+REMEDY_OF_PARTS = (
+    "write the rotation as a matrix, beside it where the camera is: 4 rows of 4 numbers"
+)
+
 
 def pose_of(frame: Fields) -> FloatArray | Lost:
     """``(4, 4)`` cam_from_world, or why there is none."""
@@ -40,7 +44,8 @@ def matrix_of(frame: Fields, key: str) -> FloatArray:
     if isinstance(rows, list) and len(rows) in (12, 16):
         flat = frame.numbers(key, (len(rows),), finite=False).reshape(-1, 4)
     elif isinstance(rows, list) and not any(isinstance(row, list) for row in rows):
-        raise frame.error(f"has a {key} of {len(rows)} numbers, not 12 or 16")
+        what = f"{frame.where} has a {key} of {len(rows)} numbers, not 12 or 16"
+        raise UserError(what, frame.path, REMEDY_OF_PARTS if len(rows) in (6, 7) else frame.remedy)
     else:
         count = 3 if isinstance(rows, list) and len(rows) == 3 else 4
         flat = frame.numbers(key, (count, 4), finite=False)

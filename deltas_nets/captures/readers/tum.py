@@ -71,7 +71,9 @@ def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
     if image_size is None:
         raise UserError("no image can be decoded", path / images.names[0], "copy the files again")
     camera, said = _camera(path, image_size) if intrinsics is None else (intrinsics, "")
-    poses = _read_trajectory(path / "groundtruth.txt").poses_at(images.stamps)
+    trajectory = _read_trajectory(path / "groundtruth.txt")
+    _check_clocks(trajectory.stamps, images.stamps, path / "groundtruth.txt")
+    poses = trajectory.poses_at(images.stamps)
     nearest = nearest_stamps(images.stamps, depths.stamps, apart=APART)
     frames, lost, late = [], {}, 0
     ids = frame_ids(without_common_folder(images.names), path / "rgb.txt")
@@ -179,6 +181,16 @@ def _read_trajectory(path: Path) -> Trajectory:
         raise _wrong_line(text, path)
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])
+
+
+def _check_clocks(poses: FloatArray, images: FloatArray, path: Path) -> None:
+    """Refuse poses of another time than all images, as in nanoseconds or of another clock."""
+    if poses[-1] < images[0] - GAP or images[-1] + GAP < poses[0]:
+        what = (
+            f"poses are of the times {poses[0]:.15g} to {poses[-1]:.15g}, "
+            f"images of {images[0]:.15g} to {images[-1]:.15g}"
+        )
+        raise UserError(what, path, "write stamps of both in seconds of one clock")
 
 
 def _wrong_line(text: str, path: Path) -> UserError:
