@@ -10,6 +10,10 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SECONDS_BETWEEN_LINES = 10.0
 """Of progress, where it is not shown on a terminal."""
@@ -74,11 +78,19 @@ def progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
     if not sys.stdout.isatty():
         yield _lines(name, total)
         return
-    from rich.progress import Progress
+    from rich.progress import Progress, TextColumn
 
-    with Progress(transient=True) as bar:
+    columns = TextColumn("{task.description}", markup=False), *Progress.get_default_columns()[1:]
+    with Progress(*columns, transient=True) as bar:
         task = bar.add_task(name, total=total)
         yield lambda _: bar.advance(task)
+
+
+def table_console() -> "Console":
+    """What prints tables: names in them are people's, whose brackets and colons are no markup."""
+    from rich.console import Console
+
+    return Console(markup=False, emoji=False)
 
 
 def _lines(name: str, total: int) -> Callable[[str], None]:

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
+from os.path import isdir, isfile  # no error of a name that is too long
 from pathlib import Path
 from textwrap import shorten
 
@@ -59,7 +60,7 @@ def load_network(name_or_file: str | Path, device: str | torch.device = "cpu") -
         raise UserError("this file holds no deltas network", file, "name a file of deltas train")
     try:
         config = from_dict(NetworkConfig, json.loads(metadata["network"]))
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, RecursionError) as error:
         raise UserError(
             f"weights of another version ({error})", file, "train again or install that version"
         ) from None
@@ -80,13 +81,13 @@ def weights_file(name_or_file: str | Path, *, beside: Iterable[str] = ()) -> Pat
     """
     file = Path(name_or_file)
     shipped = Path(str(files("deltas_nets") / "weights" / f"{name_or_file}.safetensors"))
-    if file.suffix != ".safetensors" and shipped.is_file():
+    if file.suffix != ".safetensors" and isfile(shipped):
         return shipped
-    if file.is_dir():
+    if isdir(file):
         inside = file / "weights.safetensors"
         remedy = f"name {inside}" if inside.is_file() else "name a .safetensors file"
         raise UserError("this is a folder, not weights", file, remedy)
-    if not file.is_file():
+    if not isfile(file):
         names = (DEFAULT, *beside)
         known = f"one of {', '.join(names)}" if len(names) > 1 else DEFAULT
         if str(name_or_file) in BASELINES:

@@ -17,6 +17,7 @@ from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import gmacs
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.capture import Scoring, evaluate_network
+from deltas_nets.evaluate.record import finite
 from deltas_nets.evaluate.results import METRICS_VERSION
 from deltas_nets.evaluate.scores import CaptureScores
 from deltas_nets.predict.dense import DensePredictor
@@ -29,6 +30,7 @@ __all__ = ["Measured", "Measurement", "measure"]
 
 METRICS = ("abs_rel", "abs_diff", "sq_rel", "delta1", "delta2", "delta3")
 """The supplement's."""
+NO_DEPTH = "no map has depth where the true depth is"
 
 
 @dataclass(frozen=True)
@@ -106,13 +108,16 @@ def measure(
                 continue
             identity = {"name": "any"} if step.once else _identity(records[name])
             key = measurement.key(series, step, identity)
-            row = journal[key] if key in journal else _row(series, step, predictor, measurement)
-            if key not in journal and "note" not in row:  # what is lacking may be there next time
-                journal.add(key, row)
+            if key in journal:
+                row = journal[key]
+            else:
+                row = finite(_row(series, step, predictor, measurement, device))
+                if "note" not in row:  # what is lacking may be there next time
+                    journal.add(key, row)
             rows.append({"weights": "" if step.once else shown[name], **row})
             report(f"{name} {step.name}")
     if all(row.get("abs_rel") is None for row in rows):
-        notes = "; ".join(sorted({str(row["note"]) for row in rows}))
+        notes = "; ".join(sorted({str(row.get("note", NO_DEPTH)) for row in rows}))
         raise UserError(
             f"nothing was measured ({notes})", series.name, "mend that, or use other weights"
         )
@@ -120,7 +125,7 @@ def measure(
 
 
 def _row(
-    series: Series, step: Step, predictor: Predictor, measurement: Measurement
+    series: Series, step: Step, predictor: Predictor, measurement: Measurement, device: str
 ) -> dict[str, Any]:
     head: dict[str, Any] = {"step": step.name, "value": step.value}
     view_sets = [step.views(views) for views in measurement.view_sets]
@@ -132,7 +137,8 @@ def _row(
     if step.search is not None:
         config = replace(config, depth_range=step.search)
     try:
-        network = step.change(predictor)
+        other = None if step.weights is None else load_predictor(step.weights, device)
+        network = step.change(other or predictor)
         network.check_asked(config, measurement.capture, view_sets)
         scores = evaluate_network(network, measurement.capture, view_sets, config, scoring)
     except UserError as error:

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.config.varied import NetworkSettings
-from deltas_nets.predict.predictor import Predictor, load_predictor
+from deltas_nets.predict.predictor import Predictor
 
 __all__ = ["Series", "Step", "instead", "varied"]
 
@@ -32,6 +32,8 @@ class Step:
     Raises:
         UserError: the network lacks the setting; the row says so.
     """
+    weights: str | None = None
+    """What is loaded in the network's place, by name."""
     views: Callable[[ViewSet], ViewSet] = _same
     """A view set to another."""
     search: tuple[float, float] | None = None
@@ -69,4 +71,4 @@ def varied(name: str, value: float, settings: NetworkSettings) -> Step:
 
 def instead(name: str, weights: str) -> Step:
     """Another method, whatever the network."""
-    return Step(name, None, lambda _: load_predictor(weights), once=True)
+    return Step(name, weights=weights, once=True)

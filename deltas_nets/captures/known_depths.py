@@ -4,6 +4,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.seen_places import in_images
 
 __all__ = [
     "depths_of_sensor",
@@ -38,9 +39,7 @@ def points_in_view(capture: Capture, position: int, *, least: int = ENOUGH) -> F
     found = xyz @ pose[:3, :3].T + pose[:3, 3]
     found = found[found[:, 2] > 0]
     if not told:
-        x, y, w = (found @ capture.frames.K[position].T).T
-        height, width = capture.frames.image_sizes[position]
-        found = found[(abs(2 * x / w - width) < width) & (abs(2 * y / w - height) < height)]
+        found = found[in_images(capture.frames, np.array([position]), found.T[None])[0]]
     return found if len(found) >= least else None
 
 

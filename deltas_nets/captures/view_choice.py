@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from deltas_nets.captures.capture import Capture, FloatArray
@@ -12,6 +13,7 @@ from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.known_depths import points_in_view
 from deltas_nets.captures.seen_places import seen_places
+from deltas_nets.captures.straight import WIDEST, lens_of
 from deltas_nets.captures.view_sets import ViewSet
 from deltas_nets.captures.working_depth import working_depths
 from deltas_nets.errors import UserError
@@ -169,9 +171,20 @@ def _probes(capture: Capture, anchor: int, working_depth: float) -> FloatArray:
     height, width = capture.frames.image_sizes[anchor]
     parts = (np.arange(PROBES_ACROSS) + 0.5) / PROBES_ACROSS
     x, y = np.meshgrid(parts * width - 0.5, parts * height - 0.5)
-    pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    rays = np.linalg.inv(capture.frames.K[anchor]) @ pixels
+    rays = _rays(capture, anchor, np.stack([x.ravel(), y.ravel()]))
     return np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
+
+
+def _rays(capture: Capture, position: int, pixels: FloatArray) -> FloatArray:
+    """``(3, P)`` as far as 1 along the view, of those pixels ``(2, P)`` that are made straight."""
+    frame = capture.frames.at(position)
+    ones: FloatArray = np.ones((1, pixels.shape[1]))
+    rays: FloatArray = np.linalg.inv(frame.K) @ np.concatenate([pixels, ones])
+    if frame.lens is not None:
+        seen: FloatArray = lens_of(frame).unproject(torch.from_numpy(pixels.T.copy())).rays.numpy()
+        seen = seen[seen[:, 2] > WIDEST].T
+        return seen / seen[2] if seen.size else rays
+    return rays
 
 
 def _rate(

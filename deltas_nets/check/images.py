@@ -65,7 +65,10 @@ def look_at_images(capture: Capture) -> list[Finding]:
 
 def _look(frame: Frame, position: int) -> _Seen | str:
     try:
-        with Image.open(open_span(frame.image_path, frame.image_span)) as image:
+        with (
+            open_span(frame.image_path, frame.image_span) as file,
+            Image.open(file) as image,
+        ):
             if not is_8_bit(header_of(image)):
                 return f"pixels of type {image.mode}, not 8-bit colour"
             image.draft("L", (WIDTH, WIDTH * 2 // 3))
@@ -81,6 +84,8 @@ def _look(frame: Frame, position: int) -> _Seen | str:
 
 def _sharpness(grey: NDArray[np.float32]) -> float:
     """Variance of second differences over that of first: what blur takes first."""
+    if min(grey.shape) < 3:
+        return 1.0  # too small to tell
     across = np.diff(grey, axis=1)
     inner = grey[1:-1, 1:-1]
     second = 4 * inner - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]

@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress
+from deltas_nets.terminal import progress, table_console
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,6 @@ class Calibrate(Command):
 
     def run(self) -> None:
         """Run the command."""
-        from rich.console import Console
-
         from deltas_nets.evaluate.calibration import CalibrationMeter
         from deltas_nets.evaluate.fit_calibration import fit_calibration
         from deltas_nets.evaluate.report import calibration_table, sparsification_line
@@ -88,14 +86,15 @@ class Calibrate(Command):
             measure_rooms(model, shown, before, depth_range=self.depth_range, report=report)
             fit_calibration(model, fitted_on, depth_range=self.depth_range, report=report)
             measure_rooms(model, shown, after, depth_range=self.depth_range, report=report)
-        found = f"{len(shown)} other rooms"
-        Console().print(calibration_table(before.result(), title=f"{found}, before"))
-        Console().print(calibration_table(after.result(), title=f"{found}, after"))
-        print(sparsification_line(after.result()))
         first, size = CALIBRATION_SEEDS.start, "x".join(map(str, self.size))
         counts = ", ".join(map(str, VIEWS))
         said = f"procedural rooms {first}..{first + self.rooms}, {counts} views, {size}"
+        # Before the reader of what is printed may have had enough.
         save_weights(self.out, model, metadata | {"calibration": said})
+        found, console = f"{len(shown)} other rooms", table_console()
+        console.print(calibration_table(before.result(), title=f"{found}, before"))
+        console.print(calibration_table(after.result(), title=f"{found}, after"))
+        print(sparsification_line(after.result()))
         print(f"weights in {self.out}")
 
     def _check(self) -> None:

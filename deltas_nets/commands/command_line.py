@@ -1,11 +1,13 @@
 """From the words of a command line to a command that runs, and an error in one line."""
 
 import contextlib
+import errno
 import io
 import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from textwrap import shorten
 from typing import Any, NoReturn, Union
 
@@ -52,10 +54,11 @@ def run(arguments: Sequence[str], commands: Commands) -> None:
             print(f"deltas: stopped; {command.going_on}", file=sys.stderr)
             sys.exit(130)
         except Exception as error:
-            what = lacking_memory(error)
-            if what is None or command.debug:
+            refused, what = _no_way_to(error), lacking_memory(error)
+            if (refused is None and what is None) or command.debug:
                 raise
-            _fail(UserError(what, f"deltas {type(command).__name__.lower()}", command.smaller))
+            where = f"deltas {type(command).__name__.lower()}"
+            _fail(refused or UserError(what or "", where, command.smaller))
 
 
 def parse(arguments: Sequence[str], commands: Commands) -> Command:
@@ -141,6 +144,16 @@ def _in_words(box: str) -> str:
     )
     # What a config, or one inside it, refused comes with tyro's or Python's name for where it is.
     return re.sub(r"^Error parsing (__tyro\S+|[A-Z]\w+:) ", "", said)
+
+
+def _no_way_to(error: Exception) -> UserError | None:
+    """What to say of a path at which the system does not even look; None of other errors."""
+    if not isinstance(error, OSError) or error.errno not in (errno.ENAMETOOLONG, errno.EACCES):
+        return None
+    what = f"the system refuses this path ({error.strerror})"
+    named = isinstance(error.filename, str | Path)
+    where = error.filename if named else "command line"
+    return UserError(what, where, "check it, and the permissions of the folders on the way")
 
 
 def _help_of(arguments: Sequence[str], commands: Commands) -> str:

@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.commands.values import at_least_one, not_empty, not_negative, positive
-from deltas_nets.terminal import progress, warn
+from deltas_nets.terminal import progress, table_console, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.detectors.config import TableConfig
@@ -91,8 +91,6 @@ class Detectors(Command):
         )
 
     def _of_capture(self) -> None:
-        from rich.console import Console
-
         from deltas_nets.captures.opening import open_capture
         from deltas_nets.captures.usable import check_all, usable_view_sets
         from deltas_nets.evaluate.detectors.capture import pairs_of, score_capture
@@ -116,16 +114,14 @@ class Detectors(Command):
         if not capture.metric:
             warn("the capture states no metres: what is within 5 cm is not known")
             scores = {name: found.without_lengths() for name, found in scores.items()}
-        title = f"{self.capture}: {len(pairs)} pairs of {len(view_sets)} anchors"
-        Console().print(detector_table(scores, title=title))
         if self.json is not None:
             data = {"name": capture.path.name, "view_sets": len(view_sets), "pairs": len(pairs)}
             rows = detector_rows(scores)
             write_record(self.json, record_of("detectors", rows, extractors, config, data))
+        title = f"{self.capture}: {len(pairs)} pairs of {len(view_sets)} anchors"
+        table_console().print(detector_table(scores, title=title))
 
     def _of_pairs(self) -> None:
-        from rich.console import Console
-
         from deltas_nets.evaluate.detectors.pairs_file import read_pairs, score_pairs
         from deltas_nets.evaluate.detectors.registry import load_extractors
         from deltas_nets.evaluate.detectors.report import record_of, relative_rows, relative_table
@@ -136,8 +132,9 @@ class Detectors(Command):
         pairs = evenly_spaced(read_pairs(self.capture), self.sets)
         with progress("detectors", len(pairs)) as report:
             scores = score_pairs(extractors, pairs, config, report=report)
-        Console().print(relative_table(scores, title=f"{self.capture}: {len(pairs)} pairs"))
         if self.json is not None:
             data = {"name": f"{self.capture.parent.name}/{self.capture.name}", "pairs": len(pairs)}
             rows = relative_rows(scores)
             write_record(self.json, record_of("relative poses", rows, extractors, config, data))
+        title = f"{self.capture}: {len(pairs)} pairs"
+        table_console().print(relative_table(scores, title=title))

@@ -16,7 +16,7 @@ from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, warn
+from deltas_nets.terminal import progress, table_console, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.dataset import DatasetScores
@@ -234,11 +234,9 @@ class Evaluate(Prediction):
         )
 
     def _print(self, scores: "DatasetScores", title: str) -> None:
-        from rich.console import Console
-
         from deltas_nets.evaluate import report
 
-        console, total = Console(), scores.total
+        console, total = table_console(), scores.total
         if len(scores.scenes) + len(scores.failed) > 1:
             console.print(report.scenes_table(scores, title="scenes, means over frames"))
         title = f"{title}: {len(total.frames)} frames"

@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, sensible, usable_device
 from deltas_nets.commands.values import at_least_one, not_empty, not_negative
-from deltas_nets.terminal import progress
+from deltas_nets.terminal import progress, table_console
 
 if TYPE_CHECKING:
     from deltas_nets.ablations.steps import Series
@@ -56,8 +56,6 @@ class MeasuredSeries(Command):
             kind: "ablation" or "robustness".
             num_views: of a set, where the flag says nothing.
         """
-        from rich.console import Console
-
         from deltas_nets.ablations.journal import Journal
         from deltas_nets.ablations.measure import Measurement, measure
         from deltas_nets.ablations.report import draw_series, record_of, series_tables
@@ -107,7 +105,7 @@ class MeasuredSeries(Command):
         draw_series(self.out / f"{series.name}.png", series, record.rows)
         print(f"{series.title}: {path}, {len(view_sets)} view sets")
         for table in series_tables(series, record.rows):
-            Console().print(table)
+            table_console().print(table)
         for row in record.rows:
             if row.get("note"):
                 print(f"{row['weights']} {row['step']}: {row['note']}".strip())

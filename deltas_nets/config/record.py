@@ -22,8 +22,10 @@ def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
         values: its fields; missing ones keep their defaults.
 
     Raises:
-        ValueError: a field is unknown: the record is of another version.
+        ValueError: a field is unknown, or has no fields: the record is of another version.
     """
+    if not isinstance(values, dict):
+        raise ValueError(f"{kind.__name__} must be fields by name, got {type(values).__name__}")
     hints = get_type_hints(kind)
     unknown = sorted(set(values) - set(hints))
     if unknown:

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from rich.console import Console
 from torch import nn
 
 from deltas_nets.cost.literature import PAPER_SETTING
@@ -13,7 +12,7 @@ from deltas_nets.cost.measure import cost_of
 from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_json
-from deltas_nets.terminal import warn
+from deltas_nets.terminal import table_console, warn
 
 MIN_SIDE = 32
 """Images may not be lower or narrower: nothing would be left at the coarsest scale, pixels."""
@@ -55,7 +54,7 @@ def run_cost(
         if not fitting:
             raise UserError(left_out, "command line", "change --size, or name other networks")
         warn(f"{left_out}: left out")
-    console = Console()
+    console = table_console()
     setting = f"{num_views} views, {height} x {width}, {num_keypoints} keypoints"
     costs = {}
     for name, model in fitting.items():

@@ -24,6 +24,10 @@ from deltas_nets.errors import UserError
 __all__ = ["ScanNetViewSets", "open_scannet", "view_rule"]
 
 
+MOST = 2**62
+"""The largest number of a frame, from which those of its sources can be counted."""
+
+
 class ScanNetViewSets(Dataset[PosedImages]):
     """Item i is an anchor and its sources; a map-style data set for any ``DataLoader``.
 
@@ -118,6 +122,7 @@ def open_scannet(
         for name, path in folders.items():
             if name not in skip.whole:
                 scene = read_scene_cached(path, cache)
+                _check_numbers(scene)
                 scenes[name] = skipped(scene, skip.listed(name, scene.frames.numbers))
     except OSError as error:
         what = f"the scenes cannot be read ({error.strerror or error})"
@@ -141,6 +146,15 @@ def open_scannet(
         total = len(folders) + len(missing)
         report(f"{len(missing)} of its {total} scenes are not there: {ids_in_words(missing)}")
     return found
+
+
+def _check_numbers(scene: Capture) -> None:
+    """Numbers of frames are counted on from: an integer of the machine has to hold them."""
+    ids = scene.frames.arrays.ids
+    large = [id.decode() for id in ids if int(id) > MOST] if ids.itemsize >= len(str(MOST)) else []
+    if large:
+        what = f"frame {ids_in_words(large, 1)}: the number is too large"
+        raise UserError(what, scene.path, f"number frames by at most {MOST}, best from 0")
 
 
 def _all_anchors(scenes: list[Capture], rule: ViewRule) -> NDArray[np.int32]:

@@ -51,10 +51,12 @@ def read_scene_cached(path: Path, cache: Path | None) -> Capture:
 def _state(path: Path) -> str:
     """A word that changes with every file that a scene is read from."""
     digest = hashlib.sha256(str(path.resolve()).encode())
-    # An image is only named in the scene: its folder's time says whether names have changed.
+    # Images are only named in the scene: their folder's time says whether names have changed. The
+    # first of them says how large all are.
     for folder in ("color", "depth"):
         if (path / folder).is_dir():
             digest.update(f"{folder} {(path / folder).stat().st_mtime_ns}".encode())
+            digest.update(_state_of_first(path / folder).encode())
     for folder in ("intrinsic", "pose"):
         if (path / folder).is_dir():
             with os.scandir(path / folder) as entries:
@@ -63,6 +65,17 @@ def _state(path: Path) -> str:
                     text = f"{folder} {entry.name} {state.st_mtime_ns} {state.st_size}"
                     digest.update(text.encode())
     return digest.hexdigest()[:16]
+
+
+def _state_of_first(folder: Path) -> str:
+    with os.scandir(folder) as entries:
+        numbered = (entry for entry in entries if Path(entry.name).stem.isdecimal())
+        first = min(numbered, key=lambda entry: int(Path(entry.name).stem), default=None)
+    try:
+        state = None if first is None else first.stat()
+    except OSError:  # a link that leads nowhere
+        return ""
+    return "" if state is None else f"{state.st_mtime_ns} {state.st_size}"
 
 
 def _save(file: Path, scene: Capture) -> None:

@@ -50,7 +50,7 @@ def align(
     """
     near, far = depth_range
     there = np.isfinite(predicted) & (predicted > 0)
-    both = there & (truth >= near) & (truth <= far)
+    both = there & np.isfinite(truth) & (truth >= near) & (truth <= far)
     if kind == "none" or not both.any():
         return Aligned(predicted, 1.0, 0.0)
     p, g = predicted[both], truth[both]

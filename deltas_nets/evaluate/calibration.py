@@ -143,7 +143,7 @@ class CalibrationMeter:
         if not p.shape == s.shape == g.shape:
             raise ValueError(f"shapes differ: {p.shape}, {s.shape}, {g.shape}")
         used = np.isfinite(p) & (p > 0) & np.isfinite(s) & (s > 0)
-        used &= (g >= depth_range[0]) & (g <= depth_range[1])
+        used &= np.isfinite(g) & (g >= depth_range[0]) & (g <= depth_range[1])
         if not used.any():
             return
         p, s, g = p[used], s[used], g[used]

@@ -171,7 +171,7 @@ def _evaluate(
 ) -> CaptureScores:
     scores: dict[str, MapScores | None] = {}
     failed: dict[str, UserError] = {}
-    own, seen = CalibrationMeter(), SeenMaps()
+    own, seen = CalibrationMeter(), SeenMaps(scoring.depth_range)
     measured: list[float] = []
     for views in view_sets:
         try:

@@ -34,6 +34,8 @@ SAME = 0.02
 NEIGHBOURS = 4
 FEWEST = 500
 """Places that two successive frames must share."""
+INDOORS = (0.5, 10.0)
+"""(near, far) of the true depth that counts, metres, where none is given."""
 Map = NDArray[np.float32]
 Places = NDArray[np.intp]
 
@@ -61,9 +63,14 @@ class Consistency(NamedTuple):
 
 
 class SeenMaps:
-    """Takes the maps of a scene in the order in which they were taken, made small."""
+    """Takes the maps of a scene in the order in which they were taken, made small.
 
-    def __init__(self) -> None:
+    Args:
+        depth_range: (near, far) of the true depth by which flicker is told, in the capture's unit.
+    """
+
+    def __init__(self, depth_range: tuple[float, float] = INDOORS) -> None:
+        self._depth_range = depth_range
         self._views: list[PosedViews] = []
         self._maps: list[Map] = []
         self._truths: list[Map] = []
@@ -94,6 +101,7 @@ class SeenMaps:
             flicker_of_pair(
                 (self._views[one], self._maps[one], self._truths[one]),
                 (self._views[other], self._maps[other], self._truths[other]),
+                depth_range=self._depth_range,
             )
             for one, other in pairwise(range(len(self._maps)))
         ]
@@ -126,7 +134,10 @@ def agreeing_share(here: PosedViews, depth: Map, there: PosedViews, other: Map) 
 
 
 def flicker_of_pair(
-    first: tuple[PosedViews, Map, Map], second: tuple[PosedViews, Map, Map]
+    first: tuple[PosedViews, Map, Map],
+    second: tuple[PosedViews, Map, Map],
+    *,
+    depth_range: tuple[float, float] = INDOORS,
 ) -> float | None:
     """Mean difference of the log errors of two maps at the same places; None if these are few.
 
@@ -135,8 +146,9 @@ def flicker_of_pair(
     Args:
         first: camera, map and true depth of a frame, of one size.
         second: of the next.
+        depth_range: (near, far) of the true depth that counts.
     """
-    here, there = same_places(first[0], first[2], second[0], second[2])
+    here, there = same_places(first[0], first[2], second[0], second[2], depth_range=depth_range)
     known = (first[1].ravel()[here] > 0) & (second[1].ravel()[there] > 0)
     if known.sum() < FEWEST:
         return None
@@ -145,20 +157,27 @@ def flicker_of_pair(
 
 
 def same_places(
-    here: PosedViews, depth: Map, there: PosedViews, other: Map
+    here: PosedViews,
+    depth: Map,
+    there: PosedViews,
+    other: Map,
+    *,
+    depth_range: tuple[float, float] = INDOORS,
 ) -> tuple[Places, Places]:
     """Pixels of two frames, in their flat images, that show one place by the true depth of both.
 
     Args:
         here: camera of the first frame, ``(1)``.
-        depth: ``(H, W)`` true depth, metres.
+        depth: ``(H, W)`` true depth, in the unit of the cameras.
         there: camera of the second frame.
         other: ``(h, w)`` its true depth.
+        depth_range: (near, far) of the true depth that counts.
     """
-    in_range = (depth > 0.5) & (depth < 10)
+    near, far = depth_range
+    in_range = (depth > near) & (depth < far)
     seen = _moved(here, depth, there, (other.shape[0], other.shape[1]), in_range)
     true = other.ravel()[seen.place]
-    same = (true > 0.5) & (true < 10) & (np.abs(true / seen.depth - 1) < SAME)
+    same = (true > near) & (true < far) & (np.abs(true / seen.depth - 1) < SAME)
     return seen.pixel[same], seen.place[same]
 
 
@@ -208,7 +227,7 @@ def _log_error(depth: Map, truth: Map) -> NDArray[np.float64]:
     """Log of the map by the truth; 0 where one is unknown."""
     both = (depth > 0) & (truth > 0)
     log: NDArray[np.float64] = np.log(
-        np.where(both, depth.astype(np.float64) / truth.clip(1e-3), 1)
+        np.where(both, depth.astype(np.float64) / np.where(both, truth, 1), 1)
     )
     return log
 

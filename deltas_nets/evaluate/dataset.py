@@ -24,7 +24,7 @@ class DatasetScores(NamedTuple):
         views: the view sets of each.
         failed: why there are no scores, by the names of scenes that failed.
         total: means over the frames of all scenes, each frame as much as any other, and pooled over
-            all pixels; ids are SCENE/ID.
+            all pixels; ids are SCENE/ID, but where one scene is all that was asked for.
     """
 
     scenes: Mapping[str, CaptureScores]
@@ -88,11 +88,13 @@ def evaluate_scenes(
     if not scores:
         raise next(iter(failed.values()))
     reasons = {name: str(error) for name, error in failed.items()}
-    return DatasetScores(scores, views, reasons, _total(scores, meter))
+    return DatasetScores(scores, views, reasons, _total(scores, meter, alone=len(scenes) == 1))
 
 
-def _total(scenes: Mapping[str, CaptureScores], meter: CalibrationMeter) -> CaptureScores:
-    if len(scenes) == 1:
+def _total(
+    scenes: Mapping[str, CaptureScores], meter: CalibrationMeter, *, alone: bool
+) -> CaptureScores:
+    if alone:
         return next(iter(scenes.values()))
 
     def all_of(part: str) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import torch
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from deltas_nets import __version__
@@ -24,6 +23,7 @@ from deltas_nets.predict.depth_map import PredictConfig
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import predict_frame
 from deltas_nets.predict.trial import surer, with_larger_images
+from deltas_nets.terminal import table_console
 
 STAGES = ("encoder", "detector", "descriptor", "matcher", "densifier")
 BETWEEN = "triangulation and sparse depth"
@@ -81,7 +81,7 @@ def run_demo(
     draw_prediction(figure, result, pair.depth, depth_range=config.depth_range, title=title)
     folder.write_summary("complete", seconds=round(time.perf_counter() - started, 3))
 
-    console = Console()
+    console = table_console()
     rows = {"dense": dense, "sparse points": sparse}
     console.print(metrics_table(rows, title="Middlebury Motorcycle"))
     console.print(f"sparse median error {100 * median:.2f} %")

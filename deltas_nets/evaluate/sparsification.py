@@ -44,7 +44,7 @@ def ause(
     """
     p, s, g = (np.asarray(a, dtype=np.float64).ravel() for a in (depth, deviation, truth))
     used = np.isfinite(p) & (p > 0) & np.isfinite(s)
-    used &= (g >= depth_range[0]) & (g <= depth_range[1])
+    used &= np.isfinite(g) & (g >= depth_range[0]) & (g <= depth_range[1])
     if not used.any():
         return float("nan")
     error = np.abs(p[used] - g[used]) / g[used]

@@ -203,7 +203,7 @@ def _frame(maps: Maps, frame: ShownFrame) -> dict[str, Any]:
     record = maps.record(frame.id)
     known = _numbers(record)
     facts = {}
-    if frame.score is not None:
+    if frame.score is not None and frame.score.coverage > 0:
         facts["Abs Rel"] = f"{frame.score.abs_rel:.3f}"
     if "confidence" in known:
         facts["Confidence"] = f"{known['confidence']:.2f}"

@@ -24,7 +24,7 @@ from deltas_nets.terminal import counted, warn
 __all__ = ["Page", "write_page"]
 
 PREVIEW_LONGEST, QUALITY = 1024, 90
-BYTES_OF_CAMERA = 160
+BYTES_OF_CAMERA = 260
 FRAME_OF_PAGE = 100_000
 """Bytes of all but pictures, surfaces and cameras."""
 

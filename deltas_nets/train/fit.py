@@ -2,8 +2,8 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,7 +100,8 @@ def fit(
     save()  # before the first step, so that a run can always be resumed
     failures, without_use = 0, Counter[str]()
     log_of_run = _log(fabric, folder, config, step, report)
-    with StopRequest(tells=fabric.is_global_zero) as request, log_of_run as log:
+    asked = StopRequest(tells=fabric.is_global_zero)
+    with _counted_at_the_end(without_use, tell), asked as request, log_of_run as log:
 
         def validate_at(step: int) -> None:
             if step == 0 or (step % validate_every and step != last) or log.validated(step):
@@ -139,10 +140,20 @@ def fit(
                 fabric.barrier()  # torchrun ends the others when one is gone
                 raise KeyboardInterrupt
             validate_at(step)
-    for names, count in without_use.items():
-        tell(f"{counted(count, 'step')} changed nothing; not finite: {names}")
     fabric.barrier()
     return folder / WEIGHTS
+
+
+@contextmanager
+def _counted_at_the_end(
+    without_use: Mapping[str, int], tell: Callable[[str], None]
+) -> Iterator[None]:
+    """Tell of the steps that changed nothing, however the run ends."""
+    try:
+        yield
+    finally:
+        for names, count in without_use.items():
+            tell(f"{counted(count, 'step')} changed nothing; not finite: {names}")
 
 
 def _silently(message: str) -> None:

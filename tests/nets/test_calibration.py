@@ -10,12 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from rich.console import Console
 from run_command import Run, assert_one_line
 
 from deltas_nets import load_model
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.posed_images import PosedImages
 from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.commands import calibrate
 from deltas_nets.config import DetectorConfig, NetworkConfig
 from deltas_nets.errors import UserError
 from deltas_nets.evaluate.calibration import CalibrationMeter
@@ -33,6 +35,7 @@ from deltas_nets.predict.depth_map import PredictConfig, frames_of
 from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.ours import DeltasPredictor, predict_frame
 from deltas_nets.rooms import Rooms
+from deltas_nets.terminal import table_console
 from deltas_nets.weights_file import load_weights, read_metadata, save_weights
 
 MakeCapture = Callable[..., Path]
@@ -375,8 +378,16 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_calibrate_writes_weights_that_say_so(run: Run, weights: Path, tmp_path: Path) -> None:
+def test_calibrate_writes_weights_that_say_so(
+    run: Run, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "new" / "calibrated.safetensors"
+
+    def printing() -> Console:
+        assert out.is_file()  # whatever becomes of what is printed
+        return table_console()
+
+    monkeypatch.setattr(calibrate, "table_console", printing)
     small = ("--rooms", 2, "--views", 2, "--size", 48, 64)
     command = ("calibrate", "--weights", weights, "--out", out, *small)
     result = run(*command, "--overwrite")  # of nothing

@@ -10,7 +10,8 @@ from check_plants import CAMERAS, frames, poses, scaled
 from PIL import Image, ImageFilter
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.frame import Lens
+from deltas_nets.captures.frame import Frame, Lens
+from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.check.depth_files import unreadable_depth
 from deltas_nets.check.finding import Fault
@@ -151,3 +152,16 @@ def test_sparse_points_tell_of_half_a_pixel_and_of_scale(name: str, shared_data:
         (found,) = quick_findings(planted)
         assert found.cause is cause and found.mend is not None
         assert quick_findings(found.mend(planted)) == []
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (500, 1)])
+def test_images_of_few_pixels_are_closed_and_say_nothing(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    frames = []
+    for number in range(3):
+        file = tmp_path / f"{number}.png"
+        Image.fromarray(np.full((*size, 3), 40 * number, np.uint8)).save(file)
+        frames.append(Frame(str(number), file, size, np.eye(3), np.eye(4)))
+    assert look_at_images(Capture(tmp_path, Frames.of(frames), {})) == []

@@ -1,6 +1,7 @@
 """The command: what it writes and says. What it refuses is in messages.txt."""
 
 import dataclasses
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -351,3 +352,18 @@ def test_a_config_sets_the_defaults_and_flags_change_them() -> None:
     assert command.config == wanted and command.config.batch_size == 24
     small = parse(["train", "--out", "x"], cli.COMMANDS)
     assert isinstance(small, Train) and small.config == TRAIN_CONFIGS["deltas-small"]
+
+
+@pytest.mark.parametrize("command", ["depth", "check", "evaluate", "view", "convert", "page"])
+def test_a_path_at_which_the_system_does_not_look_is_told(
+    command: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = {"convert": [tmp_path / "out"], "page": [tmp_path]}.get(command, [])
+    assert_one_line(run(command, 300 * "x", *more), "refuses this path (File name too long)")
+
+    def forbidden(path: Path) -> bool:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    for name in ("exists", "is_dir", "is_file"):
+        monkeypatch.setattr(Path, name, forbidden)
+    assert_one_line(run(command, tmp_path / "shut", *more), "refuses", "(Permission denied)")

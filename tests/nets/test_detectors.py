@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.feature import ALIKED, DISK
 from reference_tables import random_tables
+from rich.console import Console
 from run_command import Run, assert_one_line
 from small_capture import write_capture
 from torch import Tensor
@@ -26,6 +27,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.saving import save_capture
 from deltas_nets.captures.view_sets import ViewSet
+from deltas_nets.commands import detectors
 from deltas_nets.config import DetectorConfig, NetworkConfig
 from deltas_nets.distill.superpoint import SuperPoint
 from deltas_nets.errors import UserError
@@ -51,6 +53,7 @@ from deltas_nets.evaluate.some_sets import evenly_spaced
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.lite.detector import spread_points
 from deltas_nets.rooms.textures import load_picture
+from deltas_nets.terminal import table_console
 from deltas_nets.weights_file import save_weights
 
 SIZE = (96, 128)
@@ -272,11 +275,22 @@ def test_some_sets_are_spread_over_all(total: int, count: int) -> None:
     assert total - chosen[-1] <= math.ceil(total / len(chosen))
 
 
+def expect_first(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file has to be there before its table is printed, whose reader may have had enough."""
+
+    def printing() -> Console:
+        assert file.is_file()
+        return table_console()
+
+    monkeypatch.setattr(detectors, "table_console", printing)
+
+
 def test_the_command_prints_the_table_and_keeps_what_made_it(
-    run: Run, tmp_path: Path, small_weights: Path
+    run: Run, tmp_path: Path, small_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = write_capture(tmp_path / "capture", 3, image_size=SIZE, depth_size=SIZE)
     file = tmp_path / "found" / "table1.json"
+    expect_first(file, monkeypatch)
     words = ["orb", "spread", f"ours={small_weights}"]
     result = run("detectors", capture, "--detectors", *words, "--sets", 1, "--json", file)
     assert result.code == 0 and "trans@5cm" in result.out, result.err
@@ -318,8 +332,11 @@ def test_what_no_later_pair_needs_is_forgotten(tmp_path: Path) -> None:
     assert scores["spread"].points == len(spread_points(CHANCE, image_size=(48, 64)))
 
 
-def test_the_command_reads_pairs_without_depth(run: Run, tmp_path: Path) -> None:
+def test_the_command_reads_pairs_without_depth(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     capture = write_capture(tmp_path / "capture", 2, image_size=SIZE)
+    expect_first(tmp_path / "p.json", monkeypatch)
     K = "128 0 63.5 0 128 47.5 0 0 1"
     line = f"0.jpg 1.jpg 0 0 {K} {K} 1 0 0 -0.15 0 1 0 0 0 0 1 0 0 0 0 1"
     file = capture / "color" / "pairs.txt"

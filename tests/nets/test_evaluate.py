@@ -155,6 +155,7 @@ def test_scenes_that_fail_are_counted_and_the_rest_is_scored(
     said = evaluated(two_scenes, *QUICK, code=1)
     assert "intrinsic_color.txt" in said["failed_scenes"]["a"]
     assert [row["scene"] for row in said["rows"] if row["scores"] == "dense"] == ["b", "all", "a"]
+    assert list(said["abs_rel_by_frame"]) == ["b/0", "b/1"]  # as where both are scored
     assert_one_line(run("evaluate", two_scenes / "a"), "intrinsic_color.txt")
     for image in (two_scenes / "b" / "color").iterdir():
         broken(image)

@@ -8,11 +8,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from torch import Tensor
 
 from deltas_geom import PosedViews
 from deltas_nets.captures.frame import Frame, Lens
 from deltas_nets.captures.posed_images import PosedImages
-from deltas_nets.evaluate.consistency import SeenMaps, agreeing_share, same_places, shrunk
+from deltas_nets.evaluate.consistency import (
+    SeenMaps,
+    agreeing_share,
+    flicker_of_pair,
+    same_places,
+    shrunk,
+)
 from deltas_nets.rooms import render_room
 
 WALL = 2.0
@@ -44,6 +51,12 @@ def seen(
         depth = np.where(holes(truth.shape), 0, np.float32(scale) * truth)
         maps.add(given, depth, truth)
     return maps
+
+
+def moved(pose: Tensor, units: float) -> Tensor:
+    pose = pose.clone()
+    pose[..., :3, 3] *= units
+    return pose
 
 
 def camera(x: float) -> PosedViews:
@@ -81,6 +94,20 @@ def test_places_are_found_where_parallax_puts_them() -> None:
     assert len(here) == SIZE[0] * (SIZE[1] - 4)
     nearer = np.float32(0.97) * wall
     assert len(same_places(camera(0), wall, camera(0.25), nearer)[0]) == 0
+
+
+def test_flicker_is_told_by_depth_in_range_in_any_unit() -> None:
+    wall, units = np.full((48, 64), WALL, np.float32), 1e-4
+    views = [camera(0.25 * x) for x in range(2)]
+    near = [v._replace(cam_from_world=moved(v.cam_from_world, units)) for v in views]
+    found = []
+    for cameras, unit, depths in ((views, 1.0, (0.5, 10.0)), (near, units, (5e-5, 1e-3))):
+        maps = [np.float32(unit * scale) * wall for scale in (1, 1.1)]
+        truth = np.float32(unit) * wall
+        one, other = zip(cameras, maps, (truth, truth), strict=True)
+        found.append(flicker_of_pair(one, other, depth_range=depths))
+    assert found[0] == pytest.approx(np.log(1.1), rel=1e-5)
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
 
 
 def test_true_maps_agree_as_the_truth_does_and_do_not_flicker(room: PosedImages) -> None:

@@ -12,6 +12,7 @@ from small_capture import write_capture
 
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.evaluate.alignment import align
+from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, depth_sums, mean_metrics
 from deltas_nets.evaluate.scores import score_map
 from deltas_nets.evaluate.sparsification import ause
@@ -101,6 +102,14 @@ def test_sparsification_by_hand() -> None:
     assert found == pytest.approx(50 * (0.3 - 0.1) / 0.2 / 100)
     assert np.isnan(ause([2.0], [1.0], [2.0]))  # nothing is wrong
     assert np.isnan(ause([0.0], [1.0], [2.0]))  # nothing is predicted
+    without_end = {"depth_range": (0.5, np.inf)}
+    far = ause([2.2, 2.6, 2.0], [2.0, 1.0, 3.0], [2.0, 2.0, np.inf], **without_end)
+    assert far == pytest.approx(found)  # a truth that is not finite is none
+    meter, flat = CalibrationMeter(), np.float32([[2.2, 2.6, 2.0]])
+    truth = np.float32([[2.0, 2.0, np.inf]])
+    meter.add(flat, np.full_like(flat, 0.1), truth, **without_end)
+    assert meter.result().pixels == 2
+    assert np.isfinite(align(flat, truth, "scale-and-shift", **without_end).scale)
 
 
 @given(first=depths, second=depths, truth=depths)

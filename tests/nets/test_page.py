@@ -200,7 +200,9 @@ def test_one_frame_and_a_map_without_depth(make_capture: MakeCapture, tmp_path: 
     capture = make_capture(1)
     folder = write_maps(capture, tmp_path / "maps", depth=np.zeros)
     assert page_of(capture, folder).shown == 1
-    assert data_of(folder)["scene"]["layers"] == []
+    data = data_of(folder)
+    assert data["scene"]["layers"] == []
+    assert "nan" not in data["frames"][0]["facts"].values()
 
 
 def test_ids_are_not_taken_for_the_pages_own_words(

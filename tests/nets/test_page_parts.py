@@ -1,5 +1,6 @@
 """What a page is made of: colours that mean numbers, few points, and frames that fit."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,10 @@ from deltas_nets.page.colours import (
     lookup_table,
     ticks_of,
 )
+from deltas_nets.page.html import _camera
+from deltas_nets.page.scene import Camera
 from deltas_nets.page.surfaces import Surface, read_surface, thinned
+from deltas_nets.page.write import BYTES_OF_CAMERA
 
 # Colours
 
@@ -155,6 +159,14 @@ def test_a_mesh_that_is_damaged_is_refused(tmp_path: Path, fault: str) -> None:
 
 
 # Budget
+
+
+def test_a_camera_takes_no_more_than_is_kept_for_it() -> None:
+    turned = np.full((4, 4), -0.12345678)
+    turned[:3, 3] = -1.2345678e-7
+    camera = Camera("0", turned, (-0.12345678,) * 4)
+    text = json.dumps(_camera(camera, np.zeros(3), 12345))
+    assert len(text) + len(", ") <= BYTES_OF_CAMERA
 
 
 @given(count=st.integers(1, 3000), room=st.integers(10**5, 10**7), each=st.integers(1000, 400_000))

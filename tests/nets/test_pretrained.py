@@ -56,6 +56,12 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path) -> None:
     wrong.write_bytes(b"not one")
     with pytest.raises(UserError, match=r"not a safetensors file .*wrong.safetensors"):
         load_model(wrong)
+    with pytest.raises(UserError, match=r"no such weights, xxx"):
+        load_model("x" * 300)
+    for config in ("[]", '{"matcher": []}', "[" * 100_000):
+        save_file({"a": torch.zeros(1)}, wrong, {"network": config})
+        with pytest.raises(UserError, match="weights of another version"):
+            load_model(wrong)
     small = Deltas(NetworkConfig(descriptor_dim=16))
     save_weights(tmp_path / "small.safetensors", small, {})
     with pytest.raises(UserError, match=r"do not fit the network .*small.safetensors"):

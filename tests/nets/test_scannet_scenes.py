@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from small_scannet import overwrite, written_list
 
 from deltas_nets.captures.opening import open_capture
@@ -111,3 +112,16 @@ def test_poses_are_read_once_and_again_when_they_change(
     assert list(read_scene_cached(path, cache).frames) == list(first.frames)
     overwrite(path / "pose" / "3.txt", "nan " * 16)
     assert list(read_scene_cached(path, cache).frames) == ["2", "4", "5", "6", "7", "8"]
+
+
+def test_images_of_another_size_in_the_same_files_are_seen(
+    scannet_copy: Path, tmp_path: Path
+) -> None:
+    path, cache = scannet_copy / "scans" / "scene0000_00", tmp_path / "cache"
+    for image in (path / "color").iterdir():
+        overwrite(image, image.read_bytes())
+    height, width = read_scene_cached(path, cache).frames.at(0).image_size
+    for image in (path / "color").iterdir():
+        Image.open(image).resize((2 * width, 2 * height)).save(image)
+    with pytest.raises(UserError, match="intrinsics are of another resolution"):
+        read_scene_cached(path, cache)

@@ -18,6 +18,7 @@ from deltas_nets.ablations.changes import blurred, calibrated_wrong, exposed, mo
 from deltas_nets.ablations.curves import CURVES, curve
 from deltas_nets.ablations.disturbed import Disturbed, InUnit
 from deltas_nets.ablations.journal import Journal, key_of
+from deltas_nets.ablations.measure import Measurement
 from deltas_nets.ablations.paper import PAPER, SPARSE_RATIO
 from deltas_nets.ablations.report import draw_series, with_paper
 from deltas_nets.ablations.steps import Series, Step
@@ -31,6 +32,7 @@ from deltas_nets.commands.ablate import Table
 from deltas_nets.commands.robustness import Curve
 from deltas_nets.config import DetectorConfig, MatcherConfig, NetworkConfig
 from deltas_nets.config.varied import NetworkSettings
+from deltas_nets.errors import UserError
 from deltas_nets.evaluate.record import read_record
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.predict.depth_map import PredictConfig, Wanted
@@ -227,6 +229,44 @@ def test_a_table_that_was_stopped_goes_on_and_measures_nothing_twice(
     told = [row for row in record.rows if row["weights"] == "the paper (ScanNet)"]
     assert told[1]["sparse_abs_rel"] == 0.0986
     assert (tmp_path / "out" / "ratio.png").stat().st_size > 5000
+
+
+def test_a_method_in_the_networks_place_computes_where_it_would(
+    capture: Capture, model: Deltas, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def loaded(name: str, device: str) -> None:
+        asked.append((name, device))
+        raise UserError("not installed", name, "install it")
+
+    monkeypatch.setattr(measuring, "load_predictor", loaded)
+    measurement = Measurement(capture, (ViewSet("0", ("1",)),), PredictConfig())
+    for series in (TABLES["points"], TABLES["sparse"]):
+        row = measuring._row(series, series.steps[-1], DeltasPredictor(model), measurement, "cuda")
+        assert "not installed" in row["note"]
+    assert asked == [("true-points", "cuda"), ("colmap-densified", "cuda")]
+
+
+def test_maps_without_depth_are_no_figures_now_and_later(
+    capture: Capture, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(series: Series, step: Step, *_: object) -> dict[str, object]:
+        first = step is series.steps[0]
+        return {"step": step.name, "value": 0.0, "abs_rel": float("nan") if first else 0.1}
+
+    monkeypatch.setattr(measuring, "_row", without)
+    measurement = Measurement(capture, (ViewSet("0", ("1",)),), PredictConfig())
+    many = TABLES["ratio"]
+    for series, refused in ((many, False), (replace(many, steps=many.steps[:1]), True)):
+        for _ in range(2):  # measured, and read back
+            journal = Journal(tmp_path / f"{refused}.jsonl")
+            if refused:
+                with pytest.raises(UserError, match=r"nothing was measured .no map has depth"):
+                    measuring.measure(series, [str(weights)], measurement, journal)
+            else:
+                found = measuring.measure(series, [str(weights)], measurement, journal)
+                assert [row["abs_rel"] for row in found.rows] == [None, 0.1, 0.1, 0.1, 0.1]
 
 
 def test_networks_whose_files_are_called_alike_are_told_apart(

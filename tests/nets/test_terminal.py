@@ -1,11 +1,14 @@
 """Standard output that is no terminal: a pipe that somebody reads, or nobody any more."""
 
+import io
 import resource
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+from rich.table import Table
 
 from deltas_nets import terminal
 
@@ -26,6 +29,27 @@ def test_what_is_quick_tells_nothing(capsys: pytest.CaptureFixture[str]) -> None
     with terminal.progress("depth", 3) as report:
         report("7")
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("name", ["room[left]", "odd[/x]", ":smile:"])
+def test_names_are_shown_as_they_are(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Screen(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stdout", Screen())
+    table = Table(name, title=name)
+    table.add_row(name)
+    terminal.table_console().print(table)
+    with terminal.progress(name, 1) as report:
+        report("7")
+    assert sys.stdout.getvalue().count(name) >= 4  # type: ignore[attr-defined]
+
+
+def test_all_tables_are_printed_so() -> None:
+    package = Path(terminal.__file__).parent
+    users = [file for file in package.rglob("*.py") if "Console(" in file.read_text("utf-8")]
+    assert users == [package / "terminal.py"]
 
 
 @pytest.mark.parametrize("command", ["train", "depth"])

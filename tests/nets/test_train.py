@@ -215,11 +215,15 @@ def test_a_step_without_a_usable_gradient_changes_nothing_and_is_told(
             assert torch.equal(bad[part][name], tensor), f"{part} {name}"
 
 
-def test_training_that_diverges_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_that_diverges_ends_and_tells_of_steps_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
     monkeypatch.setattr(fit_module, "PATIENCE", 3)
     poison(monkeypatch, {0, 1, 3, 4, 5})
     with pytest.raises(UserError, match=r"in the 3 steps up to 6; not finite: dete.*lower --lear"):
-        fit(CONFIG, tmp_path, Start())
+        fit(CONFIG, tmp_path, Start(), report=said.append)
+    assert said[-1].startswith("5 steps changed nothing; not finite: detector")
 
 
 def test_frozen_batch_norm_keeps_its_statistics(tmp_path: Path) -> None:

@@ -149,6 +149,15 @@ def test_a_pose_that_is_no_file_costs_its_frame(scannet_copy: Path) -> None:
     assert "1 without a finite pose" in said[0]
 
 
+def test_a_number_that_is_too_large_is_told(scannet_copy: Path) -> None:
+    scene = scannet_copy / "scans" / "scene0706_01"
+    for place in ("color", "depth", "pose"):
+        (file,) = (scene / place).glob("8.*")
+        file.rename(file.with_stem(str(2**63)))
+    with pytest.raises(UserError, match=r"frame 9223372036854775808: .*too large.*scene0706_01"):
+        opened(replace(SCANNET, root=str(scannet_copy)))
+
+
 def test_what_the_system_does_not_read_is_named(
     scannet_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,7 +24,8 @@ def numbered_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> d
         if suffix is None or not name.startswith(prefix) or not path.is_file():
             continue
         digits = name[len(prefix) : len(name) - len(suffix)]
-        if digits.isascii() and digits.isdigit() and len(digits) < 19:
+        # Nanoseconds since 1970 have 19 digits.
+        if digits.isascii() and digits.isdigit() and int(digits) < 2**63:
             number, candidate = int(digits), (suffixes.index(suffix), path)
             found[number] = min(found.get(number, candidate), candidate)
     return {number: found[number][1] for number in sorted(found)}
