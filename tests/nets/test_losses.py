@@ -151,14 +151,16 @@ def test_the_right_posterior_costs_less(seen: Seen) -> None:
     right = -((inv_depth - inverse[:, None, :, None]) / 0.03).square() / 2
     mask = torch.ones_like(right, dtype=torch.bool)
 
-    def cost(logits: torch.Tensor) -> float:
-        posterior = Posterior((logits,), inv_depth, mask)
+    def cost(*stages: torch.Tensor) -> float:
+        posterior = Posterior(stages, inv_depth, mask)
         evidence = seen.prediction.evidence._replace(posterior=posterior)
         return float(
             posterior_loss(seen._replace(prediction=seen.prediction._replace(evidence=evidence)))
         )
 
     assert cost(right) < cost(torch.zeros_like(right)) < cost(right.flip(-1))
+    # The first and the last stage count in full.
+    assert cost(right, right, right) == pytest.approx(2.7 * cost(right))
 
 
 def test_smoothness_is_kornias_of_relative_inverse_depth(seen: Seen) -> None:

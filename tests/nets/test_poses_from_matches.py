@@ -82,13 +82,16 @@ def test_a_search_that_makes_no_sense_is_refused(fields: dict[str, float]) -> No
 
 
 @given(
-    motion=motions, corners=st.lists(st.tuples(numbers, numbers, numbers), min_size=3, max_size=3)
+    motion=motions,
+    corners=st.lists(st.tuples(numbers, numbers, numbers), min_size=3, max_size=3),
+    order=st.permutations(range(3)),
 )
 def test_three_points_give_the_pose_that_saw_them(
-    motion: Tensor, corners: list[tuple[float, float, float]]
+    motion: Tensor, corners: list[tuple[float, float, float]], order: list[int]
 ) -> None:
     base = torch.tensor([[-1.0, -1, 0], [1, -1, 0.3], [0, 1, -0.2]], dtype=torch.float64)
     seen = base + 0.3 * torch.tensor(corners, dtype=torch.float64) + torch.tensor([0, 0, 4.0])
+    seen = seen[order]  # clockwise or counterclockwise
     pose = moved(eye, motion)
     world = (seen - pose[:3, 3]) @ pose[:3, :3]
     poses = solve_p3p(world, F.normalize(seen, dim=-1))
