@@ -120,6 +120,16 @@ def test_pnp_finds_the_pose_among_half_wrong_matches(motion: Tensor) -> None:
     assert error.rotation < 0.2 and error.translation < 0.01
 
 
+def test_a_point_behind_the_camera_does_not_agree() -> None:
+    """Though its projection is where the match is."""
+    scene = matched(torch.zeros(6).double(), outliers=0.0)
+    points = scene.points.clone()
+    points[:5] = -points[:5]
+    found = absolute_pose(points, scene.first, K, ConsensusConfig())
+    assert found is not None
+    assert found.inliers.tolist() == [False] * 5 + [True] * (len(points) - 5)
+
+
 @settings(max_examples=6)
 @given(motion=motions)
 def test_an_essential_matrix_finds_rotation_and_direction(motion: Tensor) -> None:
