@@ -163,12 +163,10 @@ def _pose(
     weights: Tensor | None,
     mask: Tensor | None,
 ) -> _Problem:
-    cameras, broken = finite_cameras(proj)
+    cameras, _ = finite_cameras(proj)  # no point is in front of a broken one
     observed = observe(pixels, weights, mask, batch)
     start, finite = clean_points(points)
-    # One broken view outweighs all that are used, so that one sum tells both.
-    counted = observed.weights.used * (1 - proj.shape[-3] * broken).unsqueeze(-1)
-    sound = observed.weights.sound & finite & (counted.sum(dim=-2) >= 2)
+    sound = observed.weights.sound & finite & (observed.weights.used.sum(dim=-2) >= 2)
     limit = min(farthest(cameras.dtype), torch.finfo(points.dtype).max)
     return _Problem(cameras, observed, robust, start, sound, limit)
 
@@ -235,7 +233,7 @@ def _descend(problem: _Problem, steps: int) -> _End:
         # Rounding must not refuse a step at the optimum, of which it carries the gradient.
         rounded = cost * (1 + 32 * torch.finfo(cost.dtype).eps) + noise
         taken = within & (fit.cost < torch.add(rounded, safe_sqrt(cost * noise), alpha=2))
-        points, refused = either(taken, moved, points), moving & ~taken
+        points, refused = either(taken, moved, points), ~taken
         error, cost = either(taken, (fit.error, fit.cost), (error, cost))
     return points, error, valid
 

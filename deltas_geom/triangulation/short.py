@@ -65,7 +65,7 @@ class Solved(NamedTuple):
         unit: ``(*B, N)`` of the frame.
         cameras: ``(*B, N, V, 3, 4)`` of points in the frame.
         equations: ``(*B, N, V, 2, 4)`` without weights.
-        values: ``(*B, N, 4)`` eigenvalues of the normal matrix, ascending.
+        values: ``(*B, N, 4)`` eigenvalues of the normal matrix, ascending; of one view may be 2.
         vectors: ``(*B, N, 4, 4)`` its eigenvectors, columns.
     """
 
@@ -201,7 +201,7 @@ def _stand(
 def _null_vectors(equations: Array, *, exactly: bool) -> tuple[Array, Array]:
     """Eigenvalues and eigenvectors of A^T A; the first vector from A, if its digits matter."""
     a = equations.reshape(*equations.shape[:-3], -1, 4)
-    if not exactly or a.shape[-2] < 4:
+    if not exactly:
         values, vectors = np.linalg.eigh(np.swapaxes(a, -1, -2) @ a)
         return values, vectors
     _, singular, right = np.linalg.svd(a, full_matrices=False)

@@ -74,10 +74,7 @@ def weigh(
         return _all_one(size.new_ones((*batch, views, 1)))._replace(
             squared=share * share, largest=largest
         )
-    # What is not sound makes its point fail, if it is used: it need not be told from point to
-    # point where all are alike.
-    able = None if alike else sound
-    share, largest, unused, counted = _shares(only(weight, able), size, largest, torch.where)
+    share, largest, unused, counted = _shares(weight, size, largest, torch.where)
     known = counted if sound is None else (sound | unused) & counted
     return Weights(share * share, largest, unused, (~unused).to(work), known.all(dim=-2))
 
@@ -132,7 +129,7 @@ class Weighed(NamedTuple):
 
     Attributes:
         pixels: float64, 0 where not finite.
-        share: weights by each point's largest, 0 where unused or not finite.
+        share: weights by each point's largest, 0 where unused.
         largest: that; 1 if it is 0.
         used: bool.
         sound: bool, without the views' axis: every used pixel and weight is finite.
@@ -181,7 +178,6 @@ def weigh_at_hand(
     share, largest, unused, counted = _shares(size, size, largest, np.where)
     used, sound = ~unused, counted.squeeze(axis=views)
     if finite is not None:
-        share = np.where(finite, share, 0.0)
         sound = (finite | unused).all(axis=views) & sound
         pixels = np.where(np.expand_dims(finite, coordinates), pixels, 0.0)
     return Weighed(pixels, share, largest, used, sound)

@@ -25,9 +25,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from deltas_geom import PosedViews, ShapeError, diagnose, invert_pose
+from deltas_geom import PosedViews, ShapeError, diagnose, invert_pose, project
 from deltas_geom.diagnosis.causes import CURES, Cause
-from deltas_geom.diagnosis.evidence import gather_evidence, residuals
+from deltas_geom.diagnosis.evidence import distances, gather_evidence, residuals
 from deltas_geom.diagnosis.results import Diagnosis, Explanation
 from deltas_geom.diagnosis.trials import Trial, explains
 from deltas_geom.testing import seeded_scene
@@ -291,6 +291,17 @@ def test_a_ray_ends_at_the_epipole() -> None:
         pixels = torch.stack([first, second])
         evidence = gather_evidence(pixels, torch.ones(2, 9).bool())
         assert float(residuals(evidence, K, pose)) == pytest.approx(wanted)
+
+
+def test_what_stands_between_cameras_that_face_each_other_fits() -> None:
+    """Rays that come from behind the other camera, and end in front of it."""
+    K = torch.eye(3).double().expand(2, 3, 3) * torch.tensor([100.0, 100, 1]).double()[:, None]
+    pose = torch.eye(4).double().repeat(2, 1, 1)
+    pose[1, :3] = torch.tensor([[-1.0, 0, 0, 0.3], [0, 1, 0, 0.1], [0, 0, -1, 4]])
+    points = torch.rand(9, 3, generator=seeded(), dtype=torch.float64) + torch.tensor([-0.5, 0, 1])
+    pixels = project(PosedViews(K, pose), points).pixels
+    evidence = gather_evidence(pixels, torch.ones(2, 9).bool())
+    assert float(distances(evidence, K, pose).max()) < 1e-9  # px
 
 
 def test_it_takes_less_than_a_second() -> None:

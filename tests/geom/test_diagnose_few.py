@@ -15,6 +15,8 @@ from diagnosis_cases import (
 
 from deltas_geom import invert_pose
 from deltas_geom.diagnosis.causes import Cause
+from deltas_geom.diagnosis.diagnose import _well
+from deltas_geom.diagnosis.evidence import Evidence
 
 TWO_FAULTS: dict[str, Fault] = {
     "inverted, of another size": lambda K, T, x: (of_another_size(K, 2.0), invert_pose(T), x),
@@ -69,3 +71,12 @@ def test_cameras_that_see_nothing_are_not_among_the_worst() -> None:
     assert found.cause is Cause.NO_SINGLE_CAUSE and found.camera_residuals[2].isnan()
     worst = found.sentence.partition(" px off ")[2]
     assert "camera 0" in worst and "camera 2" not in worst and "nan" not in worst, worst
+
+
+def test_all_is_not_well_where_one_camera_of_many_fits_no_other() -> None:
+    pairs = torch.combinations(torch.arange(12))
+    off = (pairs == 3).any(dim=-1).double()  # of 11 in 66 pairs
+    nothing = torch.zeros(len(pairs), 0, 2)
+    evidence = Evidence(pairs, nothing, nothing, torch.zeros(len(pairs)))
+    assert not _well(9 * off, evidence, 12, limit=2.0)
+    assert _well(off, evidence, 12, limit=2.0)

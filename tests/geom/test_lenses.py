@@ -262,6 +262,17 @@ def test_what_was_measured_beyond_the_turn_of_the_polynomial_is_masked() -> None
     assert (slope[1:] == 0).all() and slope.isfinite().all()
 
 
+@MODELS
+def test_of_the_points_all_around_none_is_seen_where_another_is(model: str) -> None:
+    lens, generator = CASES[model].lens(), torch.Generator().manual_seed(0)
+    points = torch.randn(1000, 3, generator=generator, dtype=torch.float64)
+    points = points / points.norm(dim=-1, keepdim=True)
+    pixels, seen = lens.project(points)
+    rays, valid = lens.unproject(pixels[seen])
+    assert_close(rays[valid], points[seen][valid], rtol=0, atol=1e-6)
+    assert valid.double().mean() > 0.99  # but at the rim
+
+
 def test_behind_the_camera_a_fisheye_sees_and_a_pinhole_does_not() -> None:
     beyond = {"EQUIRECTANGULAR", "SIMPLE_DIVISION", "EUCM"}
     behind = torch.tensor([[1.0, 0.5, -0.2]]).double()

@@ -94,6 +94,8 @@ def test_soft_argmax_is_shift_equivariant(
     assert_close(moved.position, found.position + shift[0], rtol=0, atol=1e-10)
     assert_close(moved.covariance, found.covariance, rtol=0, atol=1e-9)
     assert_close(moved.entropy, found.entropy, rtol=0, atol=1e-10)
+    wanted = torch.distributions.Categorical(logits=logits[0]).entropy()
+    assert_close(found.entropy, wanted, rtol=0, atol=1e-12)
 
 
 @given(left=vectors(1, within=1.0, size=3), positions=vectors(7, within=10.0, size=2))
@@ -108,6 +110,7 @@ def test_a_window_leaves_the_other_mode_out(left: Tensor, positions: Tensor) -> 
     assert_close(found.covariance, windowed.covariance, rtol=0, atol=1e-10)
     assert_close(found.mass, logits.softmax(-1)[near].sum(), rtol=0, atol=1e-12)
     assert_close(found.peak, alone.peak, rtol=0, atol=0)
+    assert_close(found.entropy, alone.entropy, rtol=0, atol=0)
 
 
 @given(logits=vectors(1, within=5.0, size=7), positions=vectors(7, within=10.0, size=2))

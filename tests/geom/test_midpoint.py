@@ -192,3 +192,14 @@ def test_what_is_far_in_float32_is_far_for_dlt_too(
     result = solve(cam_from_world.float(), rays.float())
     assert (triangulate_rays(cam_from_world.float(), rays.float()).status == status).all()
     assert (result.status == status).all()
+
+
+def test_a_step_that_would_end_behind_a_camera_is_not_taken() -> None:
+    """Rays that hardly agree, next to the third camera."""
+    poses = torch.eye(4).double().repeat(3, 1, 1)
+    poses[1, 0, 3] = poses[2, 2, 3] = -0.2
+    rays = torch.tensor([[-0.4, -0.5, 1.4], [-0.6, 0.5, 1.1], [0.4, 0.9, 0.3]]).double()[:, None]
+    plain = triangulate_midpoint(poses, rays)
+    stepped = triangulate_inverse_depth_weighted(poses, rays)
+    assert plain.valid.all() and stepped.valid.all()
+    assert torch.equal(stepped.points, plain.points)

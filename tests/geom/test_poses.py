@@ -7,6 +7,7 @@ from kornia.geometry.linalg import inverse_transformation
 from torch.testing import assert_close
 
 from deltas_geom import ShapeError, camera_centers, invert_pose, is_rigid, relative_pose
+from deltas_geom.cameras.poses import recentred
 from deltas_geom.testing import rigid
 from deltas_geom.testing.strategies import poses, vectors
 
@@ -69,3 +70,10 @@ def test_axis_times_angle_is_scipys_rotation_vector(turn: torch.Tensor) -> None:
 def test_the_inverse_has_the_right_gradient() -> None:
     pose = rigid(torch.tensor([[0.1, 0.2, 0.3]]), torch.ones(1, 3)).double().requires_grad_()
     assert torch.autograd.gradcheck(invert_pose, (pose,))
+
+
+@given(pose=poses(3, turn=3.0, shift=10.0))
+def test_the_middle_of_cameras_is_that_of_the_known_ones(pose: torch.Tensor) -> None:
+    unknown = torch.where(torch.arange(3)[:, None, None] == 1, torch.nan, pose)
+    _, offset = recentred(unknown, None)
+    assert_close(offset, camera_centers(pose[[0, 2]]).mean(dim=0), rtol=0, atol=1e-13)  # m

@@ -78,6 +78,18 @@ def test_a_step_that_was_refused_is_tried_shorter(loss: Loss) -> None:
     assert torch.autograd.grad(moved.sum(), start)[0].abs().max() < 1e-3  # of the start
 
 
+def test_a_step_at_the_optimum_is_taken_whatever_a_view_of_hardly_any_weight_costs() -> None:
+    scene, weights = scene_at(20, num_views=3, count=20), torch.ones(3, 20).double()
+    proj, pixels = scene.views.proj, scene.pixels.clone()
+    weights[2], pixels[2] = 1e-5, 1e10  # px: a cost beside whose rounding that of pixels is none
+    best = refine_points(proj, pixels, scene.points, weights, steps=20).points
+    pixels.requires_grad_(True)
+    moved = refine_points(proj, pixels, best, weights)
+    assert moved.valid.all()
+    slope = torch.autograd.grad(moved.points.sum(), pixels)[0]
+    assert (slope[:2].abs().amax(dim=(0, 2)) > 1e-4).all()  # m / px
+
+
 @given(scene=posed_scenes(num_views=3), loss=st.sampled_from(LOSSES))
 def test_a_point_without_noise_stays(scene: PosedScene, loss: Loss) -> None:
     refined = refine_points(

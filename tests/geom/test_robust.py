@@ -21,6 +21,7 @@ from deltas_geom import (
 from deltas_geom.testing import PosedScene, ring, scene_from
 from deltas_geom.testing.fixed_scenes import seeded_scene
 from deltas_geom.triangulation import robust
+from deltas_geom.triangulation.pairs import pairs_of
 
 
 def seen(inputs: Inputs) -> tuple[Tensor, Tensor, Tensor]:
@@ -189,6 +190,12 @@ def test_inliers_are_within_the_threshold_of_the_point_returned(num_views: int) 
     assert (found.errors[found.inliers] < 4).all()
     assert torch.equal(found.valid, found.inliers.any(dim=0))
     assert 0.8 < found.valid.double().mean() < 1  # others are refused
+
+
+def test_fewer_pairs_than_views_begin_all_over_the_circle() -> None:
+    first, second, exist = pairs_of(torch.ones(100, 1, dtype=torch.bool), 10)
+    assert exist.all() and first.flatten().diff().tolist() == [10] * 9
+    assert torch.cat([first, second]).unique().numel() == 20  # each view as often
 
 
 def test_a_heavy_view_is_rejected_last() -> None:

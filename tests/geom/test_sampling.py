@@ -176,7 +176,7 @@ def test_a_map_of_half_precision_is_read_at_exact_places(half: torch.dtype) -> N
 
 def test_samples_at_the_sources_plane_are_masked(dtype: torch.dtype) -> None:
     scene = on_baseline(dtype=dtype)  # the source stands 0.5 m ahead
-    inv_depths = torch.tensor([0.0, 1.0, 1.98, 2 - 4e-7, 2.0, 2 + 4e-7], dtype=dtype)
+    inv_depths = torch.tensor([0.0, 1.0, 1.98, 2 - 18e-6, 2.0, 2 + 4e-7], dtype=dtype)
     for views, unit in ((scene.views, 1.0), (ELSEWHERE.views(on_baseline().views), 3.0)):
         samples = sample_inv_depths(
             views.to(dtype), scene.pixels[0], inv_depths / unit, image_size=IMAGE_SIZE

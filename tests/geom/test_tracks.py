@@ -120,3 +120,13 @@ def test_a_thousand_cameras_and_200_000_observations_take_seconds() -> None:
     assert result.valid.all() and gradient.isfinite().all()
     assert_close(result.points, points, rtol=0, atol=1e-8)  # m
     assert taken < 10  # s; 0.1 s where this was written
+
+
+def test_no_observation_counts_of_a_point_that_is_not_finite() -> None:
+    scene, proj = forward_motion(), forward_motion().views.proj
+    pixels, weights = scene.pixels[:, :2].flatten(0, 1).clone(), torch.ones(2 * len(proj)).double()
+    camera, point = torch.arange(len(proj)).repeat_interleave(2), torch.arange(2).repeat(len(proj))
+    pixels[0] = torch.nan
+    weights[1] = 0
+    found = triangulate_tracks(proj, pixels, camera, point, 2, weights)
+    assert found.used.tolist() == [False, False, *(n == 1 for n in point[2:].tolist())]

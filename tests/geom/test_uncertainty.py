@@ -384,6 +384,14 @@ def test_depth_variance_is_that_of_linear_depth(
     assert_close(found, wanted, rtol=1e-9, atol=1e-12)
 
 
+def test_the_largest_covariances_have_variances_that_are_numbers() -> None:
+    most = torch.finfo(torch.float64).max
+    proj = torch.eye(3, 4).double()[None].clone()
+    proj[0, 2, :3] = torch.tensor([0.8, 0.55, -0.24])
+    covariance = most * torch.stack([torch.ones(3, 3), torch.eye(3)]).double()
+    assert_close(depth_variance(proj, covariance), torch.full((1, 2), most, dtype=torch.float64))
+
+
 @given(drawn=weighted(), drop=st.integers(-1, 2))
 def test_parallax_is_the_largest_angle_between_rays(
     drawn: tuple[PosedScene, Tensor], drop: int

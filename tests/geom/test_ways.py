@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from triangulation_cases import noisy
 
 from deltas_geom import PosedViews, Status, triangulate, triangulate_points
-from deltas_geom.numerics import sums
+from deltas_geom.numerics import chunks, sums
 from deltas_geom.testing import forward_motion, rigid
 from deltas_geom.testing.fixed_scenes import seeded_scene
 from deltas_geom.testing.strategies import vectors
@@ -227,6 +227,68 @@ def test_a_pixel_that_is_not_finite_fails_alone_however_points_are_cut(
     assert (found.status[failing] == Status.NOT_FINITE_INPUT).all()
     sound = found.valid.nonzero().flatten()
     assert_close(found.points[sound], scene.points.repeat(7000, 1)[sound], rtol=0, atol=1e-9)
+
+
+def test_an_exported_program_holds_a_product_as_nobody_fuses_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    a, b = torch.rand(5, 3), torch.rand(3, 7)
+    monkeypatch.delattr(sums, "_FusedSums")
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+    assert_close(torch.stack(sums.over_views(a, *b.split([1, 2]))), a @ b)
+
+
+def test_most_cameras_may_stand_far_from_a_point_that_they_do_not_see() -> None:
+    scene = seeded_scene(3, num_views=2, num_points=5)
+    proj, pixels = (
+        x.repeat_interleave(4, dim=0)[3:].float() for x in (scene.views.proj, scene.pixels)
+    )
+    proj[1:-1, 0, 3] += 1e9  # some 1000 km
+    seen = torch.zeros(5, 5, dtype=torch.bool)
+    seen[[0, -1]] = True
+    with by("short"):
+        found = triangulate(proj, pixels, mask=seen)
+    assert found.valid.all()
+    assert_close(found.points.double(), scene.points, rtol=0, atol=1e-3)  # m
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_point_farther_than_float32_goes_is_at_infinity(way: str) -> None:
+    proj, pixels = torch.eye(3, 4).repeat(2, 1, 1), torch.zeros(2, 2, 2)
+    proj[1, 0, 3] = -1e37  # m to the right
+    pixels[1, :, 0] = torch.tensor([-0.02, -0.1])  # at 5e38 and at 1e38 m
+    with by(way):
+        found = triangulate(proj, pixels)
+    assert found.status.tolist() == [Status.AT_INFINITY.value, Status.OK.value]
+    assert found.points.isfinite().all()
+
+
+def test_chunks_of_one_call_have_gradients_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks, "SERIAL", 4 * 3)  # numbers: four points of three views
+    monkeypatch.setattr(chunks, "_SMALLEST_CHUNK", 4)
+    scene = seeded_scene(3, num_views=3, num_points=8, noise=0.5)
+    pixels = scene.pixels.requires_grad_(True)
+    together, apart = (
+        torch.cat([triangulate_points(scene.views.proj, part, frame="world") for part in parts])
+        for parts in ([pixels], pixels.split(1, dim=1))
+    )
+    found, wanted = (torch.autograd.grad(p.square().sum(), pixels)[0] for p in (together, apart))
+    assert_close(found, wanted)
+
+
+def test_no_used_camera_has_a_valid_point_behind_it_by_rounding() -> None:
+    away = torch.eye(4).double()
+    away[:3, 3] = torch.tensor([1e5, -2.3e5, 1.7e5])  # m, to the world's origin
+    scene = seeded_scene(20, num_views=3, num_points=1)
+    K, poses = scene.views[0], scene.views[1].clone()
+    poses[2, :3, 3] = -(poses[2, :3, :3] @ scene.points[0])  # at the point itself
+    random = torch.Generator().manual_seed(20)
+    pixels = scene.pixels.expand(3, 200, 2) + 1e-9 * torch.randn(3, 200, 2, generator=random)
+    with by("long"):
+        found = triangulate(PosedViews(K, poses @ away).proj, pixels)
+    assert found.valid.sum() > 30
+    assert (found.depth >= 0).all()
 
 
 @pytest.mark.parametrize("tiny", [1e-2, 1e-4, 1e-5])

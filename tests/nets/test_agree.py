@@ -218,6 +218,14 @@ def test_a_nearer_thing_needs_no_fewer_who_see_it_than_look_through(through: int
     assert gone.all() if through == 2 else not gone.any()
 
 
+@pytest.mark.parametrize("through", [4, 5])
+def test_what_is_behind_is_seen_if_over_four_times_as_many_look_through(through: int) -> None:
+    far, near = torch.full((1, *SIZE), 3.0).double(), torch.full((1, *SIZE), 1.0).double()
+    others = same_place(torch.cat([near[None]] + [far[None]] * through))
+    behind = hidden(near, far, camera(0), others)
+    assert behind.all() if through == 4 else not behind.any()
+
+
 @given(st.floats(0.3, 3))
 def test_votes_are_for_against_or_none(scale: float) -> None:
     depth = torch.full((1, *SIZE), 2.0).double()

@@ -11,7 +11,7 @@ import pytest
 from run_command import assert_one_line, runner
 
 from deltas_nets.errors import UserError
-from deltas_nets.outputs.alone import LOCK, Written, alone
+from deltas_nets.outputs.alone import LOCK, Written, _began, alone
 
 Process = subprocess.Popen[bytes]
 
@@ -68,6 +68,33 @@ def test_another_process_with_the_number_of_a_killed_one_holds_nobody_up(
     with alone(Written(tmp_path, "train")):
         pass
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="nobody knows when others began")
+def test_a_living_process_of_which_nobody_knew_when_it_began_holds(
+    tmp_path: Path, other: Process, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = left_by(other, Written(tmp_path, "train"), monkeypatch)
+    held = LOCK.fullmatch(file.name)
+    assert held is not None
+    file.rename(file.with_name(file.name.replace(f"~{held['began']}~", "~~")))
+    with pytest.raises(UserError, match="another run"):
+        alone(Written(tmp_path, "train")).__enter__()
+
+
+@pytest.mark.skipif(not Path("/bin/sleep").exists(), reason="a program to give a name")
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="nobody knows when others began")
+def test_brackets_in_the_name_of_a_program_are_no_end_of_it(tmp_path: Path) -> None:
+    program = tmp_path / "a) Z 1"
+    program.symlink_to("/bin/sleep")
+    odd, plain = (subprocess.Popen([name, "60"]) for name in (program, "/bin/sleep"))
+    try:
+        began = [_began(process.pid) for process in (odd, plain)]
+        assert None not in began and abs(int(began[0] or 0) - int(began[1] or 0)) < 1000  # ticks
+    finally:
+        for process in (odd, plain):
+            process.kill()
+            process.wait()
 
 
 def test_a_run_of_another_machine_is_a_warning(

@@ -130,16 +130,19 @@ def test_as_with_grid_sample_in_double_precision(seed: int) -> None:
     anchor, *others = wall(seed, 1.0, VIEWS)
     found = maps(1.02, 0.05)
     found.depth.mul_(1 + 0.05 * torch.rand(SIZE, generator=torch.Generator().manual_seed(seed)))
-    expected, inside = slowly(found, anchor, others)
+    expected, narrower, inside = slowly(found, anchor, others)
     after = compared(found, anchor, others)
     assert inside.float().mean() > 0.3
     moved = (after.depth / found.depth).log()[0].double()
     torch.testing.assert_close(moved[inside], expected[inside], rtol=0, atol=2e-5)
+    left = (after.deviation / found.deviation)[0].double()
+    torch.testing.assert_close(left[inside], narrower[inside].sqrt(), rtol=0, atol=1e-4)
 
 
 def slowly(
     found: KnownDepth, anchor: Described, others: Sequence[Described]
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How the log of depth moves, what is left of the spread, and where all depths are seen."""
     height, width = SIZE
     rows, columns = torch.meshgrid(*(torch.arange(n).double() for n in SIZE), indexing="ij")
     spread = (SHARE * found.deviation[0].double()).clamp(LEAST, MOST)
@@ -162,7 +165,10 @@ def slowly(
         likelihood.append(SHARPNESS * torch.stack(alike).mean(dim=0) - step**2 / 2)
     chosen = torch.stack(likelihood).softmax(dim=0)
     steps = torch.tensor(STEPS, dtype=torch.float64)
-    return torch.einsum("shw,s->hw", chosen, steps) * spread, inside
+    prior = (-steps.square() / 2).softmax(dim=0)
+    mean, square = (torch.einsum("shw,s->hw", chosen, steps**power) for power in (1, 2))
+    narrower = ((square - mean.square()) / (prior @ steps.square())).sqrt()
+    return mean * spread, narrower, inside
 
 
 def test_frames_are_described_once(capture: Capture) -> None:

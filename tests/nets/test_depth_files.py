@@ -92,6 +92,16 @@ def test_depth_of_another_camera_is_seen_where_its_points_are(tmp_path: Path) ->
     assert known[inside].mean() == 1
 
 
+def test_depth_behind_the_other_camera_is_not_seen_by_it(tmp_path: Path) -> None:
+    depth = np.array([[500, 500], [2000, 2000]], dtype=np.uint16)  # mm
+    ahead = np.eye(4)
+    ahead[2, 3] = -1.0  # m, that the colour camera stands before the other
+    K = np.array([[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
+    file = save(tmp_path / "depth.png", depth)
+    frame = Frame("0", file, (2, 2), K, np.eye(4), file, K, (2, 2), ahead)
+    assert set(register_depth(frame).ravel().tolist()) == {0, 1}
+
+
 def test_what_is_registered_stays_where_it_is(tmp_path: Path) -> None:
     written = sevenscenes(tmp_path / "a", make_scene())
     frame = open_capture(written.path).frames.at(0)
@@ -142,6 +152,13 @@ def test_whole_numbers_are_steps_in_whatever_file(tmp_path: Path, suffix: str) -
     assert not holds_floats(file)
     assert depth_of(file).tolist() == KNOWN.tolist()
     assert depth_of(file, depth_scale=500.0, depth_unit=9.0).tolist() == (2 * KNOWN).tolist()
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 2), (3, 2, 1)])
+def test_a_third_dimension_of_one_is_left_out(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    depth = np.arange(6, dtype=np.float32)
+    file = save(tmp_path / "depth.npy", depth.reshape(shape))
+    assert depth_of(file).tolist() == depth.reshape(3, 2).tolist()
 
 
 @pytest.mark.parametrize("suffix", ["tiff", "npy", "npz"])

@@ -46,6 +46,11 @@ def test_what_has_no_truth_counts_nowhere(truth: np.ndarray, predicted: np.ndarr
     assert depth_metrics(more, more_truth) == pytest.approx(depth_metrics(predicted, truth))
 
 
+def test_both_ends_of_the_range_count() -> None:
+    for depth, counts in ((0.5, True), (10.0, True), (0.5 - 1e-9, False), (10 + 1e-9, False)):
+        assert (depth_metrics([depth], [depth]) is not None) is counts
+
+
 def test_no_truth_gives_none_and_no_prediction_no_coverage() -> None:
     assert depth_metrics([1.0], [0.0]) is None
     metrics = depth_metrics([0.0, float("nan")], [1.0, 2.0])

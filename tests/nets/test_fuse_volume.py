@@ -11,6 +11,7 @@ from torch.testing import assert_close
 from deltas_nets.fuse import DepthView, Mesh, Volume, surface, without_small_parts
 from deltas_nets.fuse.blocks import SIDE, Blocks
 from deltas_nets.fuse.lattice import distinct_names, names_of_cubes, positions_of_cubes
+from deltas_nets.fuse.volume import _spread_points
 
 VOXEL = 0.05
 CUBES = st.lists(st.tuples(*[st.integers(-(2**20), 2**20 - 1)] * 3), min_size=1, max_size=20)
@@ -65,7 +66,15 @@ def test_threads_change_nothing() -> None:
 
 def test_voxels_hold_the_mean_signed_distance_of_all_views() -> None:
     """Against each voxel looked up in each view, one by one."""
-    views = [wall(1.0), wall(1.03, x=0.1, std=0.02)]
+    rows, columns = torch.meshgrid(*map(torch.arange, SIZE), indexing="ij")
+    slant = 0.002 * rows + 0.001 * columns
+    walls = [wall(0.95), wall(0.98, x=0.1, std=0.02)]
+    aside = torch.zeros(4, 4, dtype=torch.float64)
+    aside[:2, 3] = 0.0137  # no voxel is seen between two pixels
+    views = [
+        view._replace(depth=view.depth + slant, cam_from_world=view.cam_from_world + aside)
+        for view in walls
+    ]
     volume = fused(views)
     cubes = positions_of_cubes(volume.blocks.names)
     place = int(torch.randint(len(cubes), (1,), generator=torch.Generator().manual_seed(0)))
@@ -83,6 +92,12 @@ def test_voxels_hold_the_mean_signed_distance_of_all_views() -> None:
                     one = float(view.std[row, column]) ** -2
                     weight, distance = weight + one, distance + one * signed
         assert_close(sums[:2, voxel], torch.tensor([weight, distance]), rtol=1e-3, atol=1e-1)
+
+
+def test_the_points_of_a_wall_that_faces_a_camera_are_around_its_axis() -> None:
+    for cell in (1, 4, 16):  # pixels, of which the image has a multiple
+        points = _spread_points(wall(1.0), (cell + 0.5) / float(K[0, 0]))
+        assert_close(points.mean(dim=0), torch.tensor([0.0, 0, 1]), rtol=0, atol=1e-5)
 
 
 @settings(max_examples=10)

@@ -133,6 +133,26 @@ def test_unknown_depth_counts_nowhere(seen: Seen, loss: Callable[[Seen], torch.T
     assert loss(with_dense(seen._replace(depth=nothing), torch.ones_like(nothing))) == 0
 
 
+def test_where_known_depth_ends_is_no_edge(seen: Seen) -> None:
+    depth = torch.full((1, 1, 64, 96), 3.0)
+    log_depth = depth.log()
+    depth[..., 20:40], depth[..., 16:32, :] = 0, 0
+    assert gradient_loss(with_dense(seen._replace(depth=depth), log_depth)) < 1e-5
+
+
+def test_cells_of_which_little_is_known_count_at_no_coarser_scale(seen: Seen) -> None:
+    depth = torch.zeros(1, 1, 64, 96)
+    depth[..., ::2, ::4] = 3.0
+    wrong = with_dense(seen._replace(depth=depth), torch.full_like(depth, 3.0).log() + 0.2)
+    assert float(depth_loss(wrong)) == pytest.approx(0.2 - 0.02 / 2, rel=1e-4)  # of the finest
+
+
+def test_doubt_does_not_pull_at_depth(seen: Seen) -> None:
+    log_depth = seen.depth.log().add(0.1).requires_grad_(True)
+    assert not spread_loss(with_dense(seen, log_depth)).requires_grad
+    assert depth_loss(with_dense(seen, log_depth)).requires_grad
+
+
 @given(error=st.floats(0.01, 0.3))
 def test_the_likeliest_spread_is_the_mean_absolute_error(seen: Seen, error: float) -> None:
     depth = torch.full((1, 1, 64, 96), 3.0)
@@ -151,14 +171,16 @@ def test_the_right_posterior_costs_less(seen: Seen) -> None:
     right = -((inv_depth - inverse[:, None, :, None]) / 0.03).square() / 2
     mask = torch.ones_like(right, dtype=torch.bool)
 
-    def cost(logits: torch.Tensor) -> float:
-        posterior = Posterior((logits,), inv_depth, mask)
+    def cost(*stages: torch.Tensor) -> float:
+        posterior = Posterior(stages, inv_depth, mask)
         evidence = seen.prediction.evidence._replace(posterior=posterior)
         return float(
             posterior_loss(seen._replace(prediction=seen.prediction._replace(evidence=evidence)))
         )
 
     assert cost(right) < cost(torch.zeros_like(right)) < cost(right.flip(-1))
+    # The first and the last stage count in full.
+    assert cost(right, right, right) == pytest.approx(2.7 * cost(right))
 
 
 def test_smoothness_is_kornias_of_relative_inverse_depth(seen: Seen) -> None:

@@ -85,15 +85,16 @@ def test_what_the_other_has_no_depth_for_does_not_count() -> None:
     assert np.isnan(agreeing_share(camera(0), wall, camera(0.25), 0 * wall))
 
 
-def test_places_are_found_where_parallax_puts_them() -> None:
+@pytest.mark.parametrize("x", [0.22, 0.25, 0.28])  # 3.5 to 4.5 pixels
+def test_places_are_found_where_parallax_puts_them(x: float) -> None:
     wall = np.full(SIZE, WALL, np.float32)
-    here, there = same_places(camera(0), wall, camera(0.25), wall)
+    here, there = same_places(camera(0), wall, camera(x), wall)
     rows, columns = np.divmod(here, SIZE[1])
     assert np.array_equal(there, rows * SIZE[1] + columns - 4)
     assert columns.min() == 4
     assert len(here) == SIZE[0] * (SIZE[1] - 4)
     nearer = np.float32(0.97) * wall
-    assert len(same_places(camera(0), wall, camera(0.25), nearer)[0]) == 0
+    assert len(same_places(camera(0), wall, camera(x), nearer)[0]) == 0
 
 
 def test_flicker_is_told_by_depth_in_range_in_any_unit() -> None:
@@ -147,3 +148,4 @@ def test_one_map_and_bent_lines_say_nothing(room: PosedImages) -> None:
 def test_shrinking_keeps_values_and_places() -> None:
     image = np.arange(12, dtype=np.float32).reshape(3, 4)
     assert np.array_equal(shrunk(image.repeat(6, 0).repeat(6, 1), (3, 4)), image)
+    assert np.array_equal(shrunk(image, (1, 2)), image[1:2, 1::2])

@@ -15,7 +15,7 @@ from deltas_nets.evaluate.alignment import align
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, depth_sums, mean_metrics
 from deltas_nets.evaluate.scores import score_map
-from deltas_nets.evaluate.sparsification import ause
+from deltas_nets.evaluate.sparsification import ause, sparsification_curve
 from deltas_nets.evaluate.truth import Truth
 
 RANGE = (0.5, 10.0)
@@ -59,9 +59,10 @@ def test_what_is_aligned_does_not_depend_on_the_scale_before(
 
 
 def test_alignments_by_hand() -> None:
-    ones = np.ones((1, 4), np.float32)
-    found = align(ones, np.array([[1.0, 2.0, 6.0, 0.0]], np.float32), "median", depth_range=RANGE)
-    assert found.depth.tolist() == [[2, 2, 2, 2]]
+    ones = np.ones((1, 6), np.float32)
+    truth = np.array([[1.0, 2.0, 6.0, 0.0, 11.0, 12.0]], np.float32)  # the last beyond the range
+    found = align(ones, truth, "median", depth_range=RANGE)
+    assert found.depth.tolist() == [[2] * 6]
     # The line falls; where it is below 0 the map keeps a depth, the nearest that counts.
     falling = np.array([[3.0, 2.0, 0.0]], np.float32)
     depth = np.array([[1.0, 2.0, 9.0]], np.float32)
@@ -110,6 +111,13 @@ def test_sparsification_by_hand() -> None:
     meter.add(flat, np.full_like(flat, 0.1), truth, **without_end)
     assert meter.result().pixels == 2
     assert np.isfinite(align(flat, truth, "scale-and-shift", **without_end).scale)
+
+
+@pytest.mark.parametrize("pixels", [100, 200, 700])
+def test_each_step_takes_a_hundredth_away(pixels: int) -> None:
+    error = np.arange(1.0, pixels + 1)
+    left = pixels - pixels // 100 * np.arange(100)
+    assert sparsification_curve(error, error) == pytest.approx((left + 1) / (pixels + 1))
 
 
 @given(first=depths, second=depths, truth=depths)

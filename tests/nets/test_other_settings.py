@@ -8,9 +8,12 @@ from conftest import MakeCapture
 from run_command import Run, assert_one_line
 
 from deltas_nets.commands import depth as command
+from deltas_nets.commands.depth_folder import check_settings
+from deltas_nets.commands.measuring import MEASURED
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.prepare import prepare_output
 from deltas_nets.outputs.products import OutputOptions
+from deltas_nets.outputs.summary import FORMAT
 
 
 def prepare(out: Path, scaled_by: float, cameras: str) -> None:
@@ -71,6 +74,15 @@ def test_other_settings_are_told_before_anything_is_looked_at(
     assert_one_line(run(*begun, *asked), "an earlier run had other settings", named)
     said = run(*begun, *asked, "--overwrite")
     assert "looked" in said.err
+
+
+@pytest.mark.parametrize(("name", "value"), [(MEASURED, "measured.txt"), (FORMAT, "npz")])
+def test_what_an_earlier_run_alone_was_asked_for_is_told(
+    tmp_path: Path, name: str, value: str
+) -> None:
+    prepare_output(tmp_path, settings={"predict": {}, name: value})
+    with pytest.raises(UserError, match="other settings"):
+        check_settings(tmp_path, {"predict": {}}, None, overwrite=False)
 
 
 def test_the_same_settings_go_on(begun: tuple[object, ...], run: Run) -> None:

@@ -82,13 +82,16 @@ def test_a_search_that_makes_no_sense_is_refused(fields: dict[str, float]) -> No
 
 
 @given(
-    motion=motions, corners=st.lists(st.tuples(numbers, numbers, numbers), min_size=3, max_size=3)
+    motion=motions,
+    corners=st.lists(st.tuples(numbers, numbers, numbers), min_size=3, max_size=3),
+    order=st.permutations(range(3)),
 )
 def test_three_points_give_the_pose_that_saw_them(
-    motion: Tensor, corners: list[tuple[float, float, float]]
+    motion: Tensor, corners: list[tuple[float, float, float]], order: list[int]
 ) -> None:
     base = torch.tensor([[-1.0, -1, 0], [1, -1, 0.3], [0, 1, -0.2]], dtype=torch.float64)
     seen = base + 0.3 * torch.tensor(corners, dtype=torch.float64) + torch.tensor([0, 0, 4.0])
+    seen = seen[order]  # clockwise or counterclockwise
     pose = moved(eye, motion)
     world = (seen - pose[:3, 3]) @ pose[:3, :3]
     poses = solve_p3p(world, F.normalize(seen, dim=-1))
@@ -115,6 +118,16 @@ def test_pnp_finds_the_pose_among_half_wrong_matches(motion: Tensor) -> None:
     assert found is not None
     error = pose_error(found.model, scene.pose)
     assert error.rotation < 0.2 and error.translation < 0.01
+
+
+def test_a_point_behind_the_camera_does_not_agree() -> None:
+    """Though its projection is where the match is."""
+    scene = matched(torch.zeros(6).double(), outliers=0.0)
+    points = scene.points.clone()
+    points[:5] = -points[:5]
+    found = absolute_pose(points, scene.first, K, ConsensusConfig())
+    assert found is not None
+    assert found.inliers.tolist() == [False] * 5 + [True] * (len(points) - 5)
 
 
 @settings(max_examples=6)

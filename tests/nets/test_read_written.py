@@ -90,6 +90,19 @@ def test_the_pairs_and_depths_of_mvsnet_are_read(scene: Scene, tmp_path: Path) -
     assert np.allclose(capture.depth_ranges, [[0.5, 5.5]] * NUM)
 
 
+@pytest.mark.parametrize(
+    ("stated", "far"), [("0.5 0.1", 0.5 + 0.1 * 191), ("0.5 0.1 51", 5.5), ("0.5 0.1 51 6", 6.0)]
+)
+def test_mvsnets_depths_end_at_the_last_of_its_planes(
+    scene: Scene, tmp_path: Path, stated: str, far: float
+) -> None:
+    folder = WRITERS["MVSNet"](tmp_path / "a", scene).path
+    for file in (folder / "cams").iterdir():
+        file.write_text(file.read_text().replace("0.5 0.1 51 5.5", stated))
+    ranges = open_capture(folder).depth_ranges
+    assert ranges is not None and np.allclose(ranges, [[0.5, far]] * NUM)
+
+
 def test_intrinsics_are_taken_from_the_user_first(scene: Scene, tmp_path: Path) -> None:
     stated = Intrinsics.parse("70 71 30 20")
     for layout in ("TUM RGB-D", "Polycam"):

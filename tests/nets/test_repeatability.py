@@ -219,5 +219,23 @@ def test_strongest_points_are_apart_inside_and_in_order() -> None:
     assert (values.diff() <= 0).all()
 
 
+@pytest.mark.parametrize(
+    ("column", "row", "inside"),
+    [
+        (5, 5, True),
+        (74, 54, True),
+        (4, 5, False),
+        (75, 54, False),
+        (5, 4, False),
+        (74, 55, False),
+    ],
+)
+def test_the_border_is_as_wide_on_all_sides(column: int, row: int, inside: bool) -> None:
+    scores = torch.zeros(1, 1, *SIZE)
+    scores[0, 0, row, column] = 1
+    found = strongest_points(scores, border=5).tolist()
+    assert found == ([[column, row]] if inside else [])
+
+
 def test_a_flat_map_has_no_strongest_points() -> None:
     assert strongest_points(torch.zeros(1, 1, *SIZE)).shape == (0, 2)

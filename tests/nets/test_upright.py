@@ -52,6 +52,11 @@ def test_cameras_on_an_arc_that_all_look_down_do_not_tilt_it(pitch: float) -> No
     assert degrees_between(up, np.array([0.0, -1, 0])) < 12
 
 
+def test_how_often_a_camera_is_there_does_not_tilt_up() -> None:
+    once, yaws = np.arange(-60.0, 61, 10), np.arange(-60.0, 61, 10).repeat(20)
+    assert np.allclose(up_of(held(30.0, once, np.eye(3))), up_of(held(30.0, yaws, np.eye(3))))
+
+
 def test_cameras_that_look_straight_down_say_nothing() -> None:
     up = up_of(held(-90.0, np.arange(0.0, 360, 30), np.eye(3)))
     assert up.tolist() == [0, -1, 0]

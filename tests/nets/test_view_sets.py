@@ -16,7 +16,7 @@ from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.captures.sets_file import sets_file
 from deltas_nets.captures.usable import lone_frames, usable_view_sets
-from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.captures.view_choice import choose_view_sets, spread_sources
 from deltas_nets.captures.view_sets import ViewSet, check_frames, read_view_sets
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.summary import recorded_view_sets
@@ -261,3 +261,8 @@ def test_depth_and_evaluation_find_the_same_view_sets_in_a_capture(
     assert [(frame["frame"], frame["sources"]) for frame in frames] == [("2", "1 3")]
     refused = run("depth", path, "--view-sets", "none.json", "--out", tmp_path / "none")
     assert_one_line(refused, "does not exist, in the capture neither", "--view-sets none.json")
+
+
+def test_a_source_repeats_every_one_that_was_chosen_and_not_the_last_alone() -> None:
+    offsets = np.array([[1.0, 0, 0], [1.05, 0, 0], [-1, 0, 0], [0, 1, 0]])  # the first two alike
+    assert spread_sources(np.array([0.0, -0.1, -0.2, -1.0]), offsets, 3) == [0, 2, 3]
