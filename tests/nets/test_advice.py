@@ -120,7 +120,7 @@ def test_poses_in_nanoseconds_or_of_another_clock_are_told(
 ) -> None:
     (tmp_path / "1.png").touch()
     (tmp_path / "rgb.txt").write_text("1305031453.35 1.png\n")
-    monkeypatch.setattr(tum, "image_size_of", lambda _: (480, 640))
+    monkeypatch.setattr(tum, "size_of_first", lambda _: (480, 640))
     monkeypatch.setattr(tum, "_camera", lambda *_: (tum.Intrinsics.parse(INTRINSICS), ""))
     for stamp in ("1305031453350000000", "0.5"):
         (tmp_path / "groundtruth.txt").write_text(f"{stamp} 0 0 0 0 0 0 1\n")
