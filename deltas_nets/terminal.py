@@ -81,7 +81,8 @@ def progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
     from rich.progress import Progress, TextColumn
 
     columns = TextColumn("{task.description}", markup=False), *Progress.get_default_columns()[1:]
-    with Progress(*columns, transient=True) as bar:
+    # A console of its own: rich's common one keeps what other libraries make of it.
+    with Progress(*columns, console=table_console(), transient=True) as bar:
         task = bar.add_task(name, total=total)
         yield lambda _: bar.advance(task)
 
