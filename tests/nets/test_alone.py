@@ -57,14 +57,18 @@ def test_a_killed_run_holds_nobody_up(
     assert not list(tmp_path.iterdir())
 
 
+def begun(file: Path, when: str) -> None:
+    """Make a lock say that its process began at another time."""
+    held = LOCK.fullmatch(file.name)
+    assert held is not None
+    file.rename(file.with_name(file.name.replace(f"~{held['began']}~", f"~{when}~")))
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="nobody knows when others began")
 def test_another_process_with_the_number_of_a_killed_one_holds_nobody_up(
     tmp_path: Path, other: Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = left_by(other, Written(tmp_path, "train"), monkeypatch)
-    held = LOCK.fullmatch(file.name)
-    assert held is not None
-    file.rename(file.with_name(file.name.replace(f"~{held['began']}~", "~1~")))
+    begun(left_by(other, Written(tmp_path, "train"), monkeypatch), "1")
     with alone(Written(tmp_path, "train")):
         pass
     assert not list(tmp_path.iterdir())
@@ -74,10 +78,7 @@ def test_another_process_with_the_number_of_a_killed_one_holds_nobody_up(
 def test_a_living_process_of_which_nobody_knew_when_it_began_holds(
     tmp_path: Path, other: Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = left_by(other, Written(tmp_path, "train"), monkeypatch)
-    held = LOCK.fullmatch(file.name)
-    assert held is not None
-    file.rename(file.with_name(file.name.replace(f"~{held['began']}~", "~~")))
+    begun(left_by(other, Written(tmp_path, "train"), monkeypatch), "")
     with pytest.raises(UserError, match="another run"):
         alone(Written(tmp_path, "train")).__enter__()
 
