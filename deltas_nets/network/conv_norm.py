@@ -69,7 +69,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 def with_affine_norms(network: Network) -> Network:
-    """A copy whose norms will not change, for traces: each then holds a product, not all of a norm."""
+    """A copy whose norms will not change, for traces, which repeat what is done at every call."""
     network = copy.deepcopy(network)
     for module in list(network.modules()):
         for name, child in module.named_children():
