@@ -175,15 +175,14 @@ def differences(
         The shape of ``value``, then that of the function's result.
     """
     columns = []
-    for place in range(value.numel()):
-        index = _index(place, value)
-        change = torch.zeros_like(value)
-        change[index] = step[index]
+    for place, size in enumerate(step.flatten().tolist()):
+        change = torch.zeros_like(value, memory_format=torch.contiguous_format)
+        change.view(-1)[place] = size
         ahead, behind = (
             function(*(other + sign * change if other is value else other for other in inputs))
             for sign in (1, -1)
         )
-        columns.append((ahead - behind).detach() / (2 * step[index]))
+        columns.append((ahead - behind).detach() / (2 * size))
     return torch.stack(columns).reshape(*value.shape, *columns[0].shape)
 
 

@@ -235,9 +235,9 @@ def _check_same(
 
 
 def _same_bits(before: Tensor, after: Tensor) -> bool:
-    return before.shape == after.shape and bool(
-        ((before == after) | ((before != before) & (after != after))).all()
-    )
+    if torch.equal(before, after) or before.shape != after.shape:
+        return before.shape == after.shape
+    return bool(((before == after) | ((before != before) & (after != after))).all())
 
 
 def _single(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
