@@ -1,5 +1,6 @@
 """Strecha's multi-view benchmark: 0000.jpg and 0000.jpg.camera."""
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -60,7 +61,9 @@ def _cameras(path: Path) -> Sequence[Path]:
     if not path.is_dir():
         return ()
     found = sorted(listed(path, ".camera"))
-    folders = () if found else sorted(each for each in listed(path) if each.is_dir())
-    return found or next(
-        (inside for each in folders if (inside := sorted(listed(each, ".camera")))), ()
-    )
+    for each in () if found else sorted(listed(path)):
+        with contextlib.suppress(OSError):  # no folder, or not ours to read
+            found = sorted(listed(each, ".camera"))
+        if found:
+            break
+    return found
