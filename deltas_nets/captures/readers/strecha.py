@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.cameras import camera_of_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.listed import listed
@@ -48,7 +48,7 @@ def read(path: Path) -> Capture:
         if not (np.isfinite(sides).all() and (sides >= 1).all()):
             raise UserError("the camera's width and height are no sizes", file, _REMEDY)
         stated = int(sides[1]), int(sides[0])
-        matrix = camera_matrix(K[0], K[4], K[2], K[5], path=file)
+        matrix = camera_of_matrix(K.reshape(3, 3), path=file)
         found.add(photo, pose, matrix, stated=stated)
     doubts = finder.doubts()
     if bent:
