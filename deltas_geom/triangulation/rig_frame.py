@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deltas_geom.numerics.arithmetic import only, outside_gradients, unless_all
 from deltas_geom.numerics.sums import over_views
-from deltas_geom.numerics.vectors import Symmetric4, Vector3, dot, scaled
+from deltas_geom.numerics.vectors import Numbers, Symmetric4, Vector3, dot, scaled
 from deltas_geom.triangulation.weights import Weights
 
 
@@ -100,15 +100,36 @@ def rig_frame(weighted: tuple[Tensor, ...], counted: tuple[Tensor, ...], *, eps:
         share = count.clamp(min=1).reciprocal()
         size, middle = size * share, scaled(tuple(offset), share)
         reach = size - dot(middle, middle)
-        # Centres closer together than the rounding of where they are do not differ.
-        least = (64 * eps) ** 2 * share * from_world
-        least = torch.maximum(least, 16 * torch.finfo(size.dtype).eps * size)
-        enough = count >= 2
-        posed = enough & (reach > least)
-        apart = spread > 1e-3 * torch.finfo(size.dtype).eps * size
+        own = torch.finfo(size.dtype).eps
+        posed, enough = stand_apart(count, reach, size, share * from_world, eps=eps, own=own)
+        apart = has_spread(spread, size, own=own)
     spread = only(spread, unless_all(apart), other=1.0)
     length = spread * spread.rsqrt()  # not sqrt, for which torch starts threads
     return RigFrame(origin, length, total, middle, reach, posed, enough, broken == 0)
+
+
+def stand_apart(
+    count: Numbers, reach: Numbers, size: Numbers, from_world: Numbers, *, eps: float, own: float
+) -> tuple[Numbers, Numbers]:
+    """Whether the cameras of each point are two or more and stand apart, and the former alone.
+
+    Args:
+        count: ``(*B, N)`` of used cameras.
+        reach: ``(*B, N)`` squared spread of their centres.
+        size: ``(*B, N)`` mean squared distance of the centres from the datum.
+        from_world: ``(*B, N)`` the same from the world's origin.
+        eps: rounding of the inputs, relative.
+        own: rounding of these sums, relative.
+    """
+    enough = count >= 2
+    # Centres closer together than the rounding of where they are do not differ.
+    apart = (reach > (64 * eps) ** 2 * from_world) & (reach > 16 * own * size)
+    return enough & apart, enough
+
+
+def has_spread(spread: Numbers, size: Numbers, *, own: float) -> Numbers:
+    """Whether the weighted spread ``(*B, N)`` is a unit, and no rounding of the sums."""
+    return spread > 1e-3 * own * size
 
 
 def in_frame(normal: Symmetric4, origin: Vector3, length: Tensor) -> Symmetric4:

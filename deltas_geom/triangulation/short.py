@@ -14,6 +14,7 @@ from deltas_geom.numerics.vectors import Array
 from deltas_geom.triangulation.dlt import rows
 from deltas_geom.triangulation.judge import REASONS
 from deltas_geom.triangulation.observed import Cameras
+from deltas_geom.triangulation.rig_frame import has_spread, stand_apart
 from deltas_geom.triangulation.weights import Weighed, weigh_at_hand
 
 FEW = 256
@@ -132,7 +133,7 @@ def solve(
         spread = _over(squared, distance) / total[..., 0] - (origin * origin).sum(axis=-1)
         counted = used.astype(np.float64) if used.shape[-2] == share.shape[-2] else used * 1.0
         size, middle, reach, posed, enough = _stand(rig, counted, distance, dtype)
-        unit = np.sqrt(np.where(spread > 1e-3 * _EPS * size, spread, 1.0))
+        unit = np.sqrt(np.where(has_spread(spread, size, own=_EPS), spread, 1.0))
         if fixed:
             origin, unit = np.broadcast_to(-rig.datum, origin.shape), np.ones_like(unit)
 
@@ -191,11 +192,9 @@ def _stand(
     size = _over(counted, distance) * share
     middle = counted @ rig.offset * share[..., None]
     reach = size - (middle * middle).sum(axis=-1)
-    # Centres closer together than the rounding of where they are do not differ.
     from_world = _over(counted, (rig.centers * rig.centers).sum(axis=-1)) * share
-    least = np.maximum((64 * np.finfo(dtype).eps) ** 2 * from_world, 16 * _EPS * size)
-    enough = count >= 2
-    return size, middle, reach, enough & (reach > least), enough
+    eps = float(np.finfo(dtype).eps)
+    return size, middle, reach, *stand_apart(count, reach, size, from_world, eps=eps, own=_EPS)
 
 
 def _null_vectors(equations: Array, *, exactly: bool) -> tuple[Array, Array]:

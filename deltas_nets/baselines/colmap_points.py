@@ -48,9 +48,13 @@ def sparse_points(frames: Sequence[Frame], depth_range: tuple[float, float]) -> 
         points that the anchor's own features belong to: the others may be hidden from it.
 
     Raises:
-        UserError: pycolmap is not installed, or an image cannot be read.
+        UserError: pycolmap is not installed, an image cannot be read, or a K is skewed.
     """
     pycolmap = colmap()
+    skewed = next((frame for frame in frames if frame.K[0, 1]), None)
+    if skewed is not None:
+        what = f"K of frame {skewed.id} is skewed ({skewed.K[0, 1]:g}), which COLMAP cannot say"
+        raise UserError(what, skewed.image_path, "name another network with --weights")
     # Float64 until the camera's own arithmetic: baselines are what is left of large numbers.
     poses = anchor_views(frames, work_size=frames[0].image_size).cam_from_world.double().numpy()
     with tempfile.TemporaryDirectory() as name:

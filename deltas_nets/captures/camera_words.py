@@ -71,15 +71,15 @@ class Intrinsics(NamedTuple):
         except ValueError as error:
             wrong = str(error).partition(": ")[2][:40]
             raise UserError(f"intrinsics hold {wrong}, no number", where, remedy) from error
+        skew = 0.0
         if _is_matrix(numbers):
-            matrix = numbers.reshape(3, 3)
-            numbers = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+            skew, numbers = float(numbers[1]), numbers[[0, 4, 2, 5]]
         if len(numbers) not in _COUNTS:
             what = f"intrinsics have {len(numbers)} numbers, not 4, 8, 9 or 12"
             raise UserError(what, where, remedy)
-        if not np.isfinite(numbers).all() or (numbers[:2] <= 0).any():
+        if not np.isfinite(numbers).all() or (numbers[:2] <= 0).any() or not np.isfinite(skew):
             raise UserError("intrinsics are not finite or not positive", where, remedy)
-        return _of(numbers.tolist())
+        return _of(numbers.tolist(), skew)
 
 
 def named_camera(name: str) -> Intrinsics | None:
@@ -93,9 +93,9 @@ def named_camera(name: str) -> Intrinsics | None:
     return None if found is None else _of(KNOWN_CAMERAS[f"freiburg{found[1]}"])
 
 
-def _of(numbers: tuple[float, ...] | list[float]) -> Intrinsics:
+def _of(numbers: tuple[float, ...] | list[float], skew: float = 0.0) -> Intrinsics:
     fx, fy, cx, cy, *bends = numbers
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    K = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1.0]])
     K.setflags(write=False)
     if not any(bends):
         return Intrinsics(K, None)

@@ -37,7 +37,7 @@ def captures_inside(
     level: Sequence[Path] = [path]
     for _ in range(DEEPEST if reader is None else 1):
         level = [inside for folder in level for inside in _folders(folder)][:MOST]
-        found = [each for each in level if any(one.recognises(each) for one in readers)]
+        found = [each for each in level if any(_recognised(one, each) for one in readers)]
         if found:
             break
     if reader is None:
@@ -52,6 +52,13 @@ def several_captures(path: Path, inside: Sequence[Path]) -> UserError:
     names = ids_in_words(folder.relative_to(path).as_posix() for folder in inside)
     what = f"the folder holds {len(inside)} captures ({names}) and is none itself"
     return UserError(what, path, f"name one of them, as {inside[0]}")
+
+
+def _recognised(reader: Recogniser, folder: Path) -> bool:
+    try:
+        return reader.recognises(folder)
+    except OSError:  # not ours to read
+        return False
 
 
 def _folders(path: Path) -> Sequence[Path]:

@@ -115,6 +115,7 @@ def save_capture(
             with contextlib.suppress(OSError):
                 folder.rmdir()
         if isinstance(error, OSError):
+            check_new(out)  # another run may have been first
             raise _refused(error, out) from error
         raise
     return said

@@ -1,6 +1,5 @@
 """Which frames are looked at together: read from a file, and checked."""
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import numpy as np
 
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.centres import camera_centres
-from deltas_nets.captures.text_lines import decoded
+from deltas_nets.captures.readers.json_file import read_json
 from deltas_nets.errors import UserError
 
 __all__ = ["ViewSet", "check_frames", "doubtful_scale", "named_frames", "read_view_sets"]
@@ -39,13 +38,7 @@ def read_view_sets(
     """
     path = Path(path)
     form = 'write [{"anchor": 10, "sources": [8, 12]}, ...]'
-    try:
-        entries = json.loads(decoded(path.read_bytes()))
-    except OSError as error:
-        what = f"the view sets cannot be read ({error.strerror})"
-        raise UserError(what, path, "check the path") from error
-    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON
-        raise UserError(f"the view sets are not JSON ({error})", path, form) from error
+    entries = read_json(path, name="view sets", remedy=form)
     if not isinstance(entries, list):
         raise UserError("the view sets are not a list", path, form)
     if not entries:

@@ -1,12 +1,14 @@
 """Images that were turned when their cameras were not, as phones and viewers do by EXIF."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deltas_nets.captures.frame import FloatArray, Frame
+from deltas_nets.captures.frames import Frames
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.mending import changing_frames
 from deltas_nets.check.trying import Case, Suspect
@@ -23,13 +25,21 @@ class Turn(NamedTuple):
     Attributes:
         quarters: counterclockwise.
         with_K: whether K is of the images before, as poses are.
+        shape: of the images that were turned, where others stay as they are; all if empty.
     """
 
     quarters: int
     with_K: bool
+    shape: str = ""
+
+    def ids(self, frames: Frames) -> tuple[str, ...]:
+        """Frames whose images were turned, where others were not."""
+        return tuple(frames.kept(_SHAPES[self.shape](frames.image_sizes))) if self.shape else ()
 
     def mended(self, _: int, frame: Frame) -> Frame:
         """The frame with the camera of its image as it is."""
+        if self.shape and not _SHAPES[self.shape](np.array([frame.image_size]))[0]:
+            return frame
         K, pose, (height, width) = frame.K, frame.cam_from_world, frame.image_size
         if self.quarters % 2:  # back to the size that the camera is of
             height, width = width, height
@@ -43,15 +53,25 @@ class Turn(NamedTuple):
         return replace(frame, K=K, cam_from_world=pose)
 
     @property
+    def images(self) -> str:
+        """Which images were turned, in words."""
+        return f"the {self.shape} images" if self.shape else "the images"
+
+    @property
     def cure(self) -> str:
         """What to do to the files."""
         unturned = "K and poses" if self.with_K else "poses"
-        cure = f"turn the images back by {BACK[self.quarters]}"
+        cure = f"turn {self.images} back by {BACK[self.quarters]}"
         if not self.with_K:
             cure += ", and K with them"
         return f"{cure}; or write {unturned} of the images as they are"
 
 
+_SHAPES: Mapping[str, Callable[[NDArray[np.int64]], NDArray[np.bool_]]] = {
+    "portrait": lambda sizes: sizes[:, 0] > sizes[:, 1],
+    "landscape": lambda sizes: sizes[:, 0] < sizes[:, 1],
+}
+"""Which images have a shape, by their sizes ``(F, 2)``, (height, width)."""
 _QUARTER: FloatArray = np.array(
     [[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64
 )
@@ -69,10 +89,15 @@ def turned_images(case: Case) -> Iterator[Suspect]:
 
 
 def _tried(case: Case, turns: tuple[Turn, ...]) -> Iterator[Suspect]:
-    for turn in turns:
+    sizes = case.capture.frames.image_sizes
+    mixed = all(of_shape(sizes).any() for of_shape in _SHAPES.values())
+    # Phones turn what was taken upright, and nothing else.
+    shapes = ("", *_SHAPES) if mixed else ("",)
+    for turn in (turn._replace(shape=shape) for shape in shapes for turn in turns):
         mend = changing_frames(turn.mended)
         found = case.mended(mend)
         if found.explains:
             fault = Fault.IMAGES_TURNED if turn.with_K else Fault.IMAGES_TURNED_BESIDE_POSES
-            what = f"images turned back by {BACK[turn.quarters]} fit: {found.in_words}"
-            yield Suspect(found, Finding(fault, what, (), turn.cure, "error", mend))
+            what = f"{turn.images} turned back by {BACK[turn.quarters]} fit: {found.in_words}"
+            ids = turn.ids(case.capture.frames)
+            yield Suspect(found, Finding(fault, what, ids, turn.cure, "error", mend))

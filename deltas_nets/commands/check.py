@@ -88,13 +88,15 @@ class Check(Command):
                 checked = check_capture(
                     capture, network, known=found, threads=threads, report=report
                 )
-        if self.json is not None:  # before the reader of what is printed may have had enough
-            write_json(self.json, checked.in_json())
-        for line in report_lines(checked, self.capture, self.intrinsics):
-            print(line)
-        if self.mend is not None:
-            if capture is not None and checked.mendable:
+        try:  # before the reader of what is printed may have had enough
+            if self.json is not None:
+                write_json(self.json, checked.in_json())
+            if self.mend is not None and capture is not None and checked.mendable:
                 save_capture(checked.mended(capture), self.mend, placing="link")
+        finally:
+            for line in report_lines(checked, self.capture, self.intrinsics):
+                print(line)
+        if self.mend is not None:
             print(mended_in_words(checked, self.mend))
         if checked.findings:
             sys.stdout.flush()

@@ -84,8 +84,8 @@ class Convert(Command):
 
             source = depth_source(capture, self.depths)
             source.check()
-            if isinstance(source, Predicted) and source.missing:
-                warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
+            if isinstance(source, Predicted) and source.left_out is not None:
+                warn(source.left_out)
             capture = with_maps(source.capture, self.depths)
             with progress("points", len(source.ids)) as report:
                 found = seeds(source, self.points or POINTS, report=report)

@@ -23,11 +23,14 @@ def warn_of(name: str, capture: "Capture", maps: Path | None) -> None:
         capture: with the true depth.
         maps: the folder of maps that are there already, if they are.
     """
-    from deltas_nets.outputs.summary import SUMMARY, read_summary
+    from deltas_nets.outputs.summary import SUMMARY, read_summary, unfinished
     from deltas_nets.outputs.their_capture import in_their_unit
 
     if not (capture if maps is None else in_their_unit(capture, maps)).metric:
         warn(f"{name}: lengths and --depth-range are in its own unit, not in metres")
+    waits = None if maps is None else unfinished(maps)
+    if waits is not None:
+        warn(f"not all maps of {maps} are there: {waits}")
     said = {} if maps is None else (read_summary(maps / SUMMARY) or {}).get("settings", {})
     if said.get("sensor_depth", {}).get("from") == "sensor":
         warn("the maps were made with the sensor depth that they are scored against")

@@ -121,8 +121,8 @@ class Fuse(Command):
             least=self.least,
         )
         source = depth_source(capture, self.depths, min_confidence=self.min_confidence)
-        if isinstance(source, Predicted) and source.missing:
-            warn(f"{counted(source.missing, 'map')} of the folder left out, as not finished")
+        if isinstance(source, Predicted) and source.left_out is not None:
+            warn(source.left_out)
         if len(source.ids) == 1 and config.neighbours:
             warn("there is one map, and none to compare it with")
             config = sensible(FuseConfig, voxel=self.voxel, neighbours=0)

@@ -1,14 +1,14 @@
-"""What `deltas cost` does: measure, print, write."""
+"""What `deltas cost` does: measure, write, print."""
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import torch
 from torch import nn
 
 from deltas_nets.cost.literature import PAPER_SETTING
-from deltas_nets.cost.measure import cost_of
+from deltas_nets.cost.measure import Cost, cost_of
 from deltas_nets.cost.report import comparison_table, cost_table, costs_as_json
 from deltas_nets.errors import UserError
 from deltas_nets.outputs.atomic_files import write_json
@@ -27,7 +27,7 @@ def run_cost(
     repeats: int = 5,
     json: Path | None = None,
 ) -> None:
-    """Print what each network costs, and beside the paper's figures if the setting is the paper's.
+    """Tell what each network costs, and beside the paper's figures if the setting is the paper's.
 
     Args:
         models: by name, called as `Deltas` is.
@@ -54,23 +54,17 @@ def run_cost(
         if not fitting:
             raise UserError(left_out, "command line", "change --size, or name other networks")
         warn(f"{left_out}: left out")
-    console = table_console()
-    setting = f"{num_views} views, {height} x {width}, {num_keypoints} keypoints"
-    costs = {}
-    for name, model in fitting.items():
-        cost = costs[name] = cost_of(model, num_views, image_size, num_keypoints, repeats=repeats)
-        console.print(cost_table(cost, title=f"{name}: {setting}"))
-        console.print(
-            f"Intermediate tensors hold {cost.peak_bytes / 1e6:.1f} MB at once. Products are "
-            "convolutions and matrix products; a multiply-accumulate is two operations. Times "
-            f"are the median of {repeats}, on {device_name(model)}.\n"
-        )
-        if cost.unknown:
-            warn(f"{name}: not counted for want of a formula: {', '.join(sorted(cost.unknown))}")
-    if (num_views, image_size, num_keypoints) == PAPER_SETTING:
-        console.print(comparison_table(costs))
-    if json is not None:
-        devices = {name: device_name(model) for name, model in fitting.items()}
+    costs: dict[str, Cost] = {}
+
+    def measured() -> Iterator[str]:
+        for name, model in fitting.items():
+            costs[name] = cost_of(model, num_views, image_size, num_keypoints, repeats=repeats)
+            yield name
+
+    names: Iterable[str] = measured()
+    devices = {name: device_name(model) for name, model in fitting.items()}
+    if json is not None:  # before the reader of what is printed may have had enough
+        names = list(names)
         write_json(
             json,
             {
@@ -83,6 +77,20 @@ def run_cost(
                 **costs_as_json(costs),
             },
         )
+    console = table_console()
+    setting = f"{num_views} views, {height} x {width}, {num_keypoints} keypoints"
+    for name in names:
+        cost = costs[name]
+        console.print(cost_table(cost, title=f"{name}: {setting}"))
+        console.print(
+            f"Intermediate tensors hold {cost.peak_bytes / 1e6:.1f} MB at once. Products are "
+            "convolutions and matrix products; a multiply-accumulate is two operations. Times "
+            f"are the median of {repeats}, on {devices[name]}.\n"
+        )
+        if cost.unknown:
+            warn(f"{name}: not counted for want of a formula: {', '.join(sorted(cost.unknown))}")
+    if (num_views, image_size, num_keypoints) == PAPER_SETTING:
+        console.print(comparison_table(costs))
 
 
 def _takes(model: nn.Module, image_size: tuple[int, int]) -> bool:

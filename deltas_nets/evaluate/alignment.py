@@ -53,14 +53,20 @@ def align(
     both = there & np.isfinite(truth) & (truth >= near) & (truth <= far)
     if kind == "none" or not both.any():
         return Aligned(predicted, 1.0, 0.0)
-    p, g = predicted[both], truth[both]
+    # Predictions of any size, down to 1e-45, have a scale in float64.
+    all_p = predicted.astype(np.float64)
+    p, g = all_p[both], truth[both].astype(np.float64)
     if kind == "median":
-        scale = float(np.median(g / p))
-        return Aligned(predicted * np.float32(scale), scale, 0.0)
-    scale, shift = _least_squares(p.astype(np.float64), g.astype(np.float64))
-    moved = np.maximum(scale * predicted.astype(np.float64) + shift, 0)
-    moved = np.where(moved > 0, moved, near)
-    return Aligned(np.where(there, moved, 0).astype(np.float32), scale, shift)
+        scale, shift = float(np.median(g / p)), 0.0
+        moved = scale * all_p
+    else:
+        scale, shift = _least_squares(p, g)
+        moved = np.maximum(scale * all_p + shift, 0)
+        moved = np.where(moved > 0, moved, near)
+    # What leaves the range of float32 stays a prediction, and a wrong one.
+    ends = np.finfo(np.float32)
+    moved = np.where(there, moved.clip(ends.smallest_subnormal, ends.max), 0)
+    return Aligned(moved.astype(np.float32), scale, shift)
 
 
 def _least_squares(p: NDArray[np.float64], g: NDArray[np.float64]) -> tuple[float, float]:

@@ -107,7 +107,8 @@ class RobustMvdModel:
                 in its absolute track, and the network looks for itself then.
 
         Raises:
-            ValueError: poses or intrinsics are missing: depth follows from them.
+            ValueError: poses or intrinsics are missing, from which depth follows, or there is no
+                such key view.
         """
         if poses is None or intrinsics is None:
             raise ValueError("deltas triangulates: poses and intrinsics must be given")
@@ -116,9 +117,12 @@ class RobustMvdModel:
             raise ValueError(
                 f"images, poses and intrinsics must be of as many views, got {numbers}"
             )
+        keys = np.atleast_1d(np.asarray(keyview_idx))
+        if not np.isin(keys, range(len(images))).all():
+            raise ValueError(f"keyview_idx must be in 0..{len(images) - 1}, got {keys.tolist()}")
         return {
             "images": [np.asarray(image) for image in images],
-            "keyview_idx": np.atleast_1d(np.asarray(keyview_idx)).astype(int),
+            "keyview_idx": keys.astype(int),
             "poses": [np.asarray(pose, dtype=np.float64) for pose in poses],
             "intrinsics": [np.asarray(K, dtype=np.float64) for K in intrinsics],
             "depth_range": depth_range,

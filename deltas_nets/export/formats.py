@@ -19,7 +19,9 @@ from deltas_nets.config import to_dict
 from deltas_nets.errors import UserError
 from deltas_nets.export.agreement import Agreement, Inputs, check_agreement
 from deltas_nets.export.graph import (
+    IMAGE_RANGE,
     INPUTS,
+    MEANING,
     OUTPUTS,
     ExportConfig,
     parameters_sha256,
@@ -132,6 +134,8 @@ def metadata_of(
         "network": to_dict(model.config),
         "export": to_dict(config),
         "depth_range": config.depth_range,
+        "image_range": IMAGE_RANGE,
+        "inputs": MEANING,
         "weights": {**(weights or {}), "parameters_sha256": parameters_sha256(model)},
         "versions": {"deltas-depth": __version__, "torch": torch.__version__},
     }
@@ -169,6 +173,8 @@ def onnx_bytes(program: ExportedProgram, metadata: Mapping[str, str], out: Path)
     proto: Any = exported.model_proto
     for node in (*proto.graph.node, *(node for part in proto.functions for node in part.node)):
         del node.metadata_props[:]  # where our source files were
+    for known in proto.graph.input:
+        known.doc_string = MEANING[known.name]
     for name, value in metadata.items():
         proto.metadata_props.add(key=name, value=value)
     content: bytes = proto.SerializeToString()

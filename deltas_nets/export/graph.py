@@ -18,8 +18,15 @@ from deltas_geom.numerics.arithmetic import outside_autocast
 from deltas_nets.network.conv_norm import with_affine_norms
 from deltas_nets.network.deltas import Deltas
 
-INPUTS = ("images", "K", "cam_from_world")
-"""Names of the graph's inputs, in order."""
+IMAGE_RANGE = (0.0, 1.0)
+"""Of the images: a graph cannot refuse others, and makes confident nonsense of them."""
+MEANING = {
+    "images": "(1, V, 3, H, W) RGB in [0, 1], not 0..255, not normalised; view 0 is the anchor",
+    "K": "(1, V, 3, 3) pixels of these images, the top-left pixel's centre at (0, 0)",
+    "cam_from_world": "(1, V, 4, 4) OpenCV axes, metres",
+}
+"""The graph's inputs, in order."""
+INPUTS = tuple(MEANING)
 OUTPUTS = ("depth", "std", "keypoints", "points")
 """Names of its outputs, in order."""
 

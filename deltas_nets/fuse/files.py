@@ -20,14 +20,15 @@ __all__ = ["check_mesh_extra", "write_cloud_ply", "write_glb", "write_mesh_ply"]
 def write_cloud_ply(path: Path, cloud: CloudPoints, up: FloatArray | None = None) -> None:
     """Write points with normals and colours as binary PLY; see `write_mesh_ply`."""
     vertices = vertices_of(xyz=cloud.points, normal=cloud.normals, rgb=cloud.colors)
-    content = header_of(vertices.dtype, len(vertices)) + vertices.tobytes()
+    content = header_of(vertices.dtype, len(vertices), *_upward(up)) + vertices.tobytes()
     write_atomically(path, lambda file: file.write(content))
 
 
 def write_mesh_ply(path: Path, mesh: Mesh, up: FloatArray | None = None) -> None:
     """Write a mesh with coloured vertices as binary PLY.
 
-    Coordinates are the world's, wherever its ``up`` is: float, or double where they are too large.
+    Coordinates are the world's, wherever its ``up`` is, which a comment in the header says: float,
+    or double where they are too large.
     """
     vertices = vertices_of(xyz=mesh.vertices, rgb=mesh.colors)
     more = (f"element face {len(mesh.faces)}", "property list uchar int vertex_indices")
@@ -35,11 +36,15 @@ def write_mesh_ply(path: Path, mesh: Mesh, up: FloatArray | None = None) -> None
     faces["count"], faces["vertices"] = 3, mesh.faces
 
     def write(file: Any) -> None:
-        file.write(header_of(vertices.dtype, len(vertices), *more))
+        file.write(header_of(vertices.dtype, len(vertices), *_upward(up), *more))
         file.write(vertices.tobytes())
         file.write(faces.tobytes())
 
     write_atomically(path, write)
+
+
+def _upward(up: FloatArray | None) -> list[str]:
+    return [] if up is None else ["comment up_in_world " + " ".join(f"{axis:.9g}" for axis in up)]
 
 
 def check_mesh_extra(path: Path) -> None:

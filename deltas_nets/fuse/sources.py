@@ -18,8 +18,9 @@ from deltas_nets.fuse.depth_view import DepthView, nearest
 from deltas_nets.fuse.deviation import std_of_confidence, std_of_sensor
 from deltas_nets.outputs.confidence_maps import confidence_file, read_confidence
 from deltas_nets.outputs.depth_formats import MAKE_ANEW, read_depth_map
-from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale
+from deltas_nets.outputs.summary import SUMMARY, read_summary, recorded_depth_scale, unfinished
 from deltas_nets.outputs.their_capture import made_of
+from deltas_nets.terminal import counted
 
 __all__ = ["DepthSource", "Predicted", "Sensed", "depth_source"]
 
@@ -105,10 +106,19 @@ class Predicted:
             what = "the maps state no confidence"
             raise UserError(what, "--min-confidence", "leave it out")
         self._least = round(255 * (LEAST_CONFIDENCE if min_confidence is None else min_confidence))
-        self.ids, self.missing = found.ids, len(found.missing)
+        self.ids, self._missing = found.ids, len(found.missing)
         self.least_confidence = self._least / 255 if self._has_confidence else 0.0
         self.doubtful: dict[str, float] = {}
         self.settings = {"depth": summary["settings"], "min_confidence": self._least / 255}
+
+    @property
+    def left_out(self) -> str | None:
+        """A warning of frames that were to have a map and have none."""
+        if not self._missing:
+            return None
+        waits = unfinished(self._folder)
+        said = f"{counted(self._missing, 'map')} of the folder left out, as not finished"
+        return said if waits is None else f"{said}: {waits}"
 
     def check(self) -> None:
         """Raise what reading would, as far as that is quickly told."""

@@ -45,7 +45,7 @@ def build_stages(config: NetworkConfig) -> Stages:
     encoder = look_up("deltas_nets.network", row.place)
     matcher = build_matcher(config.matcher, config.descriptor_dim)
     if row.stages == "lite":
-        return _lite_stages(config, encoder(), matcher)
+        return _lite_stages(config, encoder.whole(), matcher)
     return _paper_stages(config, encoder(3, 64), encoder(1, 16), matcher)
 
 

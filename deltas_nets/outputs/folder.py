@@ -6,7 +6,7 @@ finished, whenever the run before was killed. Which files those are is a table i
 ``running``) and at the end (``complete``, or ``stopped`` where frames are missing and no run is at
 work); what it does not hold yet is in a journal (`deltas_nets.outputs.journal`). Several shards may
 fill one folder; each keeps its own summary.I-of-N.json beside the summary of all, which names those
-that it is ``waiting_for`` when none is running.
+that it is ``waiting_for``.
 """
 
 from collections.abc import Iterable, Mapping

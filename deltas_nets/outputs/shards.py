@@ -50,10 +50,9 @@ def _merged(out: Path, count: int, own: dict[str, Any], parts: _Parts) -> dict[s
     for part in parts.values():
         frames |= part["frames"]
     statuses = {index: part["status"] for index, part in parts.items()}
-    if "running" in statuses.values():
-        return own | {"status": "running", "frames": frames}
     missing = [index for index in range(1, count + 1) if statuses.get(index) != "complete"]
     if not missing:
         return own | {"status": "complete", "frames": frames}
     waiting = [f"{index}/{count}" for index in missing]
-    return own | {"status": "stopped", "waiting_for": waiting, "frames": frames}
+    status = "running" if "running" in statuses.values() else "stopped"
+    return own | {"status": status, "waiting_for": waiting, "frames": frames}

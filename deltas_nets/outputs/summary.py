@@ -40,6 +40,17 @@ def read_summary(path: Path) -> dict[str, Any] | None:
     return content if dicts else None
 
 
+def unfinished(out: Path) -> str | None:
+    """What a folder of maps waits for, in words; None if it is complete or records no run."""
+    summary = read_summary(out / SUMMARY)
+    if summary is None or summary.get("status") == "complete":
+        return None
+    shards = summary.get("waiting_for")
+    if not shards:
+        return "the run that fills it has not finished"
+    return f"the folder is complete after --shard {', '.join(map(str, shards))}"
+
+
 def recorded_view_sets(out: Path) -> tuple[ViewSet, ...]:
     """The view sets of the run that filled a folder.
 

@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,14 @@ def test_without_pycolmap_the_extra_is_named(
     for name in ("colmap-sparse", "colmap-densified"):
         said = run("evaluate", folder, "--weights", name)
         assert_one_line(said, "pycolmap", 'pip install "deltas-depth[colmap]"')
+
+
+def test_colmap_refuses_what_its_cameras_cannot_say(room: Capture) -> None:
+    pytest.importorskip("pycolmap")
+    anchor, *sources = frames_of(room, SETS)
+    K = anchor.K + np.array([[0, 1.5, 0], [0, 0, 0], [0, 0, 0]])
+    with pytest.raises(UserError, match="is skewed"):
+        colmap_points.sparse_points([replace(anchor, K=K), *sources], (0.5, 10.0))
 
 
 def test_points_of_colmap_are_on_the_surfaces(room: Capture) -> None:

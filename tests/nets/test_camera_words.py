@@ -24,7 +24,14 @@ def test_intrinsics_in_words(text: str) -> None:
     assert (lens and tuple(lens)) == STATED[text]
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3", "a b c d", "0 1 2 3", "nan 1 1 1", "freiburg4"])
+def test_a_matrix_may_be_skewed() -> None:
+    assert Intrinsics.parse("500 7 320 0 510 240 0 0 1").K[0].tolist() == [500, 7, 320]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "500 nan 320 0 510 240 0 0 1", "1 2 3", "a b c d", "0 1 2 3", "nan 1 1 1", "freiburg4"],
+)
 def test_what_is_no_camera_is_refused(text: str) -> None:
     with pytest.raises(UserError) as error:
         Intrinsics.parse(text)

@@ -1,11 +1,15 @@
 """A folder that is none itself: the only capture in it is opened, of several all are named."""
 
+import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small_capture import write_capture
 
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.captures.readers import colmap_folder
 from deltas_nets.captures.saving import save_capture
 from deltas_nets.errors import UserError
 
@@ -48,6 +52,40 @@ def test_the_only_capture_of_a_folder_is_opened(tmp_path: Path, to: str) -> None
     (tmp_path / "download" / "previews").mkdir()
     outer, inner = (open_capture(tmp_path / "download" / part) for part in ("", "scan"))
     assert outer.layout == inner.layout and list(outer.frames) == list(inner.frames)
+
+
+@pytest.mark.parametrize("to", ["own", "colmap"])
+@pytest.mark.parametrize("shut", ["shut", "a/shut"])
+def test_a_folder_that_may_not_be_read_hides_no_capture_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, shut: str
+) -> None:
+    _with(tmp_path / "made", scan=to)
+    (tmp_path / "download" / shut).mkdir(parents=True)
+    (tmp_path / "made").rename(tmp_path / "download" / "b")
+
+    def refusing(really: Callable[..., Any]) -> Callable[..., Any]:
+        def asked(path: str | Path = ".") -> Any:
+            if Path(path) == tmp_path / "download" / shut:
+                raise PermissionError(13, "Permission denied", str(path))
+            return really(path)
+
+        return asked
+
+    for name in ("scandir", "listdir"):
+        monkeypatch.setattr(os, name, refusing(getattr(os, name)))
+    assert len(open_capture(tmp_path / "download").frames) == 2
+
+
+def test_of_very_many_folders_some_are_looked_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(40):
+        (tmp_path / str(number) / "inside").mkdir(parents=True)
+    looked: list[Path] = []
+    monkeypatch.setattr(colmap_folder, "FOLDERS_LIMIT", 5)
+    monkeypatch.setattr(colmap_folder, "_is_model", looked.append)
+    assert not colmap_folder.has_model(tmp_path)
+    assert len(looked) == 1 + 2 * 5
 
 
 def test_it_may_lie_three_folders_down_and_no_deeper(tmp_path: Path) -> None:

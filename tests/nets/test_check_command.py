@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from room_capture import write_scene
 from run_command import Run, assert_one_line
 
 from deltas_nets.captures.opening import open_capture
+from deltas_nets.check import words
+from deltas_nets.check.words import report_lines
 from deltas_nets.rooms import render_room
 
 Change = Callable[[Path], None]
@@ -79,11 +82,18 @@ def test_a_capture_that_is_well_has_no_finding(run: Run, room: Path, tmp_path: P
     "name", [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in WRITTEN]
 )
 def test_a_fault_is_named_and_mended_by_the_command_that_is_told(
-    name: str, run: Run, copy: Path, tmp_path: Path
+    name: str, run: Run, copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plant, cause = WRITTEN[name]
     plant(copy)
     report, out = tmp_path / "told.json", tmp_path / "mended"
+
+    def printed(*told: Any) -> list[str]:
+        """The reader of what is printed may have had enough of it."""
+        assert report.is_file() and out.is_dir()
+        return report_lines(*told)
+
+    monkeypatch.setattr(words, "report_lines", printed)
     result = run("check", copy, "--json", report, "--mend", out)
     assert result.code == 1
     (found,) = json.loads(report.read_text())["findings"]

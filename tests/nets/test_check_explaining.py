@@ -18,7 +18,7 @@ from PIL import Image
 from room_capture import write_scene
 
 from deltas_geom.diagnosis.evidence import residuals
-from deltas_nets.captures.capture import Capture
+from deltas_nets.captures.capture import Capture, Frame
 from deltas_nets.captures.opening import open_capture
 from deltas_nets.check.axes import other_axes
 from deltas_nets.check.evidence import evidence_of
@@ -51,6 +51,24 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Looked:
     return capture, match_capture(capture, load_model())
 
 
+@pytest.fixture(scope="module")
+def some_upright(few: Looked, tmp_path_factory: pytest.TempPathFactory) -> Looked:
+    """The six frames, of which every other one shows the middle alone, higher than wide."""
+    folder = tmp_path_factory.mktemp("upright")
+
+    def middle(number: int, frame: Frame) -> Frame:
+        if number % 2 == 0:
+            return frame
+        Image.fromarray(frame.read_image()[:, 48:208]).save(folder / f"{number}.png")
+        K = frame.K - np.array([[0, 0, 48], [0, 0, 0], [0, 0, 0]])
+        return replace(
+            frame, K=K, image_path=folder / f"{number}.png", image_size=(frame.image_size[0], 160)
+        )
+
+    capture = frames(middle)(few[0])
+    return capture, match_capture(capture, load_model())
+
+
 @pytest.mark.parametrize(
     ("given", "after", "explains"),
     [(6.6, 3.3, False), (29.0, 3.7, False), (4.5, 1.5, False), (2.2, 0.9, True), (6.6, 0.2, True)],
@@ -79,6 +97,24 @@ def test_turned_images_are_named_and_their_cameras_found(with_K: bool, few: Look
     found = min(tried, key=lambda suspect: suspect.tried.after).finding
     assert found.cause is (Fault.IMAGES_TURNED if with_K else Fault.IMAGES_TURNED_BESIDE_POSES)
     assert "by 90 degrees clockwise" in found.evidence and found.mend is not None
+    mended = found.mend(planted).frames
+    assert np.allclose(mended.K, capture.frames.K)
+    assert np.allclose(mended.cam_from_world, capture.frames.cam_from_world)
+
+
+@pytest.mark.parametrize(("with_K", "portrait"), [(True, False), (False, True)])
+def test_of_mixed_photos_those_of_one_shape_may_be_turned(
+    with_K: bool, portrait: bool, some_upright: Looked
+) -> None:
+    capture, matched = some_upright
+    turned = before_a_turn if with_K else pose_before_a_turn
+    ids = ("1", "3", "5") if portrait else ("0", "2", "4")
+    planted = frames(lambda i, f: turned(i, f) if f.id in ids else f)(capture)
+    (found,) = judge_matches(planted, matched)[0]
+    assert found.cause is (Fault.IMAGES_TURNED if with_K else Fault.IMAGES_TURNED_BESIDE_POSES)
+    assert found.frames == ids and found.mend is not None
+    shape = "portrait" if portrait else "landscape"
+    assert found.cure.startswith(f"turn the {shape} images back by 90 degrees clockwise")
     mended = found.mend(planted).frames
     assert np.allclose(mended.K, capture.frames.K)
     assert np.allclose(mended.cam_from_world, capture.frames.cam_from_world)

@@ -243,6 +243,21 @@ def test_a_sensor_is_no_folder_of_maps(make_capture: MakeCapture, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
+def test_of_two_that_write_one_folder_the_first_is_kept_whole(
+    capture: Capture, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+
+    def other(id: str) -> None:
+        if not out.exists():
+            save_capture(capture, out, "transforms")
+
+    with pytest.raises(UserError, match="the folder is not empty"):
+        save_capture(capture, out, report=other)
+    assert len(open_capture(out).frames) == len(capture.frames)
+    assert not (out / "frames.json").exists() and not list(tmp_path.glob(".*"))
+
+
 @pytest.mark.parametrize("full", [True, False])
 def test_what_is_to_blame_for_a_copy_that_fails_is_named(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: bool

@@ -16,6 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from deltas_geom import PosedViews
 from deltas_nets.config import CONFIGS, MatcherConfig, NetworkConfig
+from deltas_nets.cost import command
 from deltas_nets.cost.command import run_cost
 from deltas_nets.cost.literature import PAPER_PARTS, PAPER_TOTAL
 from deltas_nets.cost.measure import Cost, cost_of, cost_of_run, posed_noise
@@ -416,9 +417,22 @@ def test_json_holds_the_same(cost: Cost) -> None:
 
 
 def test_the_command_prints_and_writes(
-    small: Deltas, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small: Deltas,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = tmp_path / "cost.json"
+    with monkeypatch.context() as patch:
+
+        def printing() -> None:
+            """The reader of what is printed has had enough."""
+            raise BrokenPipeError
+
+        patch.setattr(command, "table_console", printing)
+        with pytest.raises(BrokenPipeError):
+            run_cost({"net": small}, image_size=SIZE, num_keypoints=64, repeats=1, json=file)
+    assert json.loads(file.read_text())["repeats"] == 1
     run_cost({"net": small}, image_size=SIZE, num_keypoints=64, repeats=1, json=file)
     said = capsys.readouterr()
     assert "net: 2 views, 96 x 128, 64 keypoints" in said.out

@@ -1,5 +1,6 @@
 """Image encoders: what each states of itself is what the other stages and training go by."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,16 +10,18 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews
-from deltas_nets.config import MatcherConfig, NetworkConfig, TrainConfig
+from deltas_nets.config import CONFIGS, MatcherConfig, NetworkConfig, TrainConfig
 from deltas_nets.config.encoders import ENCODERS, Encoder
 from deltas_nets.errors import UserError
 from deltas_nets.network import build
+from deltas_nets.network.cost_volume import network
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.encoder import Origin
 from deltas_nets.network.features import Channels
 from deltas_nets.network.layers import ConvBlock
 from deltas_nets.network.lite.efficientnet import EfficientNetLite0
 from deltas_nets.network.lite.encoder import LiteEncoder
+from deltas_nets.network.networks import build_network
 from deltas_nets.train.optimiser import make_optimizer
 
 
@@ -58,6 +61,39 @@ def test_the_other_stages_take_the_channels_that_an_encoder_states(
         with torch.no_grad():
             depth = model(torch.rand(2, 3, 32, 48), PosedViews(K, pose), num_keypoints=16).depth
     assert depth.shape == (1, 32, 48) and (depth > 0).all()
+
+
+class NoFine(Tiny):
+    """An encoder whose author forgot the last line of __init__."""
+
+    channels = Channels(1, 2, 3, 4, 5)
+
+    def __init__(self) -> None:
+        super().__init__()
+        del self.fine
+
+
+class NoOrigin(LiteEncoder):
+    """An encoder that starts from nowhere."""
+
+    channels = Channels(1, 2, 3, 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "forgotten"), [(Tiny, "channels"), (NoFine, "fine"), (NoOrigin, "origin")]
+)
+@pytest.mark.parametrize("name", ["deltas-small", "cost-volume"])
+def test_what_an_encoder_forgets_is_named_with_the_line_to_write(
+    kind: type[LiteEncoder], forgotten: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ENCODERS, "tiny", Encoder("lite", "lite.tiny:Tiny"))
+    for place in (build, network):
+        monkeypatch.setattr(place, "look_up", lambda package, place: kind)
+    config = replace(CONFIGS[name], backbone="tiny")
+    with pytest.raises(
+        TypeError, match=rf"{kind.__name__} has no {forgotten}: write .*{forgotten}"
+    ):
+        build_network(config)
 
 
 def test_an_encoder_that_is_not_in_the_table_is_refused() -> None:

@@ -251,6 +251,11 @@ def test_maps_in_files_are_scored_scene_by_scene(
     (tmp_path / "maps" / "a" / "depth" / "1.png").unlink()
     gone = evaluated(two_scenes / "a", "--predictions", tmp_path / "maps" / "a", code=1)
     assert list(gone["failed"]) == ["1"]
+    summary = tmp_path / "maps" / "a" / "summary.json"
+    said = json.loads(summary.read_text()) | {"status": "stopped", "waiting_for": ["2/2"]}
+    summary.write_text(json.dumps(said))
+    evaluated(two_scenes / "a", "--predictions", tmp_path / "maps" / "a", code=1)
+    assert "the folder is complete after --shard 2/2" in evaluated.told.warnings[0]
 
 
 def test_view_sets_may_lie_in_each_scene(two_scenes: Path, evaluated: Evaluated) -> None:

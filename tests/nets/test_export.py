@@ -223,6 +223,7 @@ def assert_tells_what_it_is(metadata: dict[str, str], exported: Exported) -> Non
     known = {name: json.loads(value) for name, value in metadata.items()}
     assert known["network"]["name"] == "deltas-small"
     assert known["depth_range"] == [0.5, 10.0]
+    assert known["image_range"] == [0, 1] and "[0, 1]" in known["inputs"]["images"]
     assert known["export"]["num_views"] == exported.config.num_views
     assert known["export"]["image_size"] == list(SIZE)
     assert known["weights"]["step"] == "7"

@@ -278,9 +278,12 @@ def test_one_map_alone_is_fused_with_a_warning(
     write_maps(tmp_path / "maps", path)
     for id in (0, 1, 3):
         (tmp_path / "maps" / "depth" / f"{id}.png").unlink()
+    summary = tmp_path / "maps" / "summary.json"
+    summary.write_text(json.dumps(json.loads(summary.read_text()) | {"status": "stopped"}))
     result = run("fuse", path, tmp_path / "maps", "--out", tmp_path / "out")
     assert result.code == 0, result.err
-    assert result.warnings[0] == "3 maps of the folder left out, as not finished"
+    left_out = "3 maps of the folder left out, as not finished"
+    assert result.warnings[0] == f"{left_out}: the run that fills it has not finished"
     assert len(result.warnings) == 2
     assert "none to compare" in result.warnings[1]
 

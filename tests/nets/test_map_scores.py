@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from small_capture import write_capture
 
 from deltas_nets.captures.opening import open_capture
-from deltas_nets.evaluate.alignment import align
+from deltas_nets.evaluate.alignment import Alignment, align
 from deltas_nets.evaluate.calibration import CalibrationMeter
 from deltas_nets.evaluate.depth_metrics import depth_metrics, depth_sums, mean_metrics
 from deltas_nets.evaluate.scores import score_map
@@ -68,6 +68,17 @@ def test_alignments_by_hand() -> None:
     depth = np.array([[1.0, 2.0, 9.0]], np.float32)
     found = align(depth, falling, "scale-and-shift", depth_range=RANGE)
     assert found.depth == pytest.approx(np.array([[3, 2, 0.5]]), abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["median", "scale-and-shift"])
+def test_predictions_near_the_least_float_are_aligned_and_stay_predictions(
+    kind: Alignment,
+) -> None:
+    truth = np.array([[1.0, 2.0, 3.0, 2.0]], np.float32)
+    tiny = np.array([[1e-40, 2e-40, 3e-40, 8.0]], np.float32)
+    found = align(tiny, truth * (tiny < 1), kind, depth_range=RANGE).depth
+    assert np.isfinite(found).all() and (found > 0).all()
+    assert found[0, :3] == pytest.approx(truth[0, :3], rel=1e-4)
 
 
 def test_a_flat_map_is_shifted_alone_and_holes_stay_holes() -> None:

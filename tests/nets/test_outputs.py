@@ -34,7 +34,7 @@ from deltas_nets.outputs.products import (
     write_depth_png,
     write_points_ply,
 )
-from deltas_nets.outputs.summary import difference, shard_summary
+from deltas_nets.outputs.summary import difference, shard_summary, unfinished
 from deltas_nets.predict.depth_map import PredictConfig
 
 SETTINGS: dict[str, Any] = {"weights": "deltas-small", "views": 3, "depth_range": (0.5, 10.0)}
@@ -324,6 +324,7 @@ def test_shards_share_a_folder_and_its_summary(tmp_path: Path) -> None:
     write_frame(first, "1")
     first.write_summary("complete")
     assert summary_of(tmp_path)["status"] == "running"
+    assert unfinished(tmp_path) == "the folder is complete after --shard 2/2"
     second.write_summary("stopped")
     assert summary_of(tmp_path)["status"] == "stopped"
     assert summary_of(tmp_path)["waiting_for"] == ["2/2"]
@@ -331,7 +332,7 @@ def test_shards_share_a_folder_and_its_summary(tmp_path: Path) -> None:
     second.write_summary("complete")
     summary = summary_of(tmp_path)
     assert summary["status"] == "complete" and set(summary["frames"]) == {"1", "2"}
-    assert "waiting_for" not in summary
+    assert "waiting_for" not in summary and unfinished(tmp_path) is None
     # A shard that starts again leaves the others' frames alone.
     again = prepare_output(
         tmp_path, settings=SETTINGS, shard=(2, 2), frame_ids=["2"], overwrite=True

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import struct
 import sys
 import time
@@ -59,6 +60,17 @@ def test_polycams_images_stand_in_for_corrected_ones_with_a_warning(
     (keyframes / "corrected_images").rename(keyframes / "images")
     capture = open_capture(tmp_path)
     assert len(capture.frames) == NUM and "corrected_images is missing" in capture.doubts[-1]
+
+
+@pytest.mark.parametrize("named", ["", "keyframes"])
+def test_polycams_cameras_without_images_are_told_as_such(
+    scene: Scene, tmp_path: Path, named: str
+) -> None:
+    keyframes = WRITERS["Polycam"](tmp_path, scene).path / "keyframes"
+    shutil.rmtree(keyframes / "corrected_images")
+    with pytest.raises(UserError, match="no folder of their images") as error:
+        open_capture(tmp_path / named)
+    assert error.value.where == keyframes / "corrected_images"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux alone")

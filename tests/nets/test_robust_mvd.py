@@ -109,6 +109,9 @@ def test_without_poses_there_is_nothing_to_triangulate(
         model.input_adapter(given["images"], 0)
     with pytest.raises(ValueError, match="of as many views"):
         model.input_adapter(given["images"], 0, given["poses"][1:], given["intrinsics"])
+    for key in (-1, NUM, 0.5):  # -1 was the last view, and among its own sources
+        with pytest.raises(ValueError, match=r"keyview_idx must be in 0\.\.2"):
+            model.input_adapter(**given, keyview_idx=np.array([0, key]))
 
 
 def test_metrics_are_per_cent_at_the_size_of_the_truth() -> None:

@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 SIZE = 48, 64
 F, CX, CY = 60.0, 31.2, 23.9
 K = np.array([[F, 0, CX], [0, F, CY], [0, 0, 1]])
+SKEWED = np.array([[F, 0.75, CX], [0, F, CY], [0, 0, 1]])
+"""Of formats that state a matrix."""
 OPENGL = np.diag([1.0, -1, -1, 1])
 NUM = 4
 
@@ -169,9 +171,9 @@ def robustmvd(folder: Path, scene: Scene) -> Written:
     places = [folder / "key", *(folder / "source" / str(i) for i in range(NUM - 1))]
     for place, pose, image in zip(places, scene.cam_from_world, scene.images, strict=True):
         write_image(place / "image.png", image)
-        np.save(place / "K.npy", K.astype(np.float32))
+        np.save(place / "K.npy", SKEWED.astype(np.float32))
         np.save(place / "to_ref_transform.npy", pose @ scene.world_from_cam[0])
-    return Written(folder, ["key", *(str(i) for i in range(NUM - 1))])
+    return Written(folder, ["key", *(str(i) for i in range(NUM - 1))], K=SKEWED)
 
 
 def opensfm(folder: Path, scene: Scene) -> Written:
@@ -257,7 +259,7 @@ def kapture(folder: Path, scene: Scene) -> Written:
 
 
 def mvsnet(folder: Path, scene: Scene) -> Written:
-    moved = np.array([[F, 0, CX + 0.5], [0, F, CY + 0.5], [0, 0, 1]])
+    moved = np.array([[F, 0.75, CX + 0.5], [0, F, CY + 0.5], [0, 0, 1]])
     for i, pose in enumerate(scene.cam_from_world):
         rows = "extrinsic", *pose, "", "intrinsic", *moved, "", "0.5 0.1 51 5.5"
         write_text(folder / "cams" / f"{i:08d}_cam.txt", *rows)
@@ -267,12 +269,12 @@ def mvsnet(folder: Path, scene: Scene) -> Written:
         line for i in range(NUM) for line in (str(i), f"2 {(i + 2) % NUM} 9.5 {(i + 1) % NUM} 3")
     ]
     write_text(folder / "pair.txt", str(NUM), *pairs)
-    return Written(folder, [f"{i:08d}" for i in range(NUM)], None, True, metric=False)
+    return Written(folder, [f"{i:08d}" for i in range(NUM)], None, True, metric=False, K=SKEWED)
 
 
 def sens(folder: Path, scene: Scene) -> Written:
     four = np.eye(4)
-    four[:3, :3] = K
+    four[:3, :3] = SKEWED
     out = struct.pack("<IQ", 4, 6) + b"sensor"
     for matrix in (four, np.eye(4), four, np.eye(4)):
         out += matrix.astype("<f4").tobytes()
@@ -284,7 +286,7 @@ def sens(folder: Path, scene: Scene) -> Written:
         out += colour + steps
     folder.mkdir(parents=True)
     (folder / "scene.sens").write_bytes(out)
-    return Written(folder / "scene.sens", [str(i) for i in range(NUM)], None, True)
+    return Written(folder / "scene.sens", [str(i) for i in range(NUM)], None, True, K=SKEWED)
 
 
 def demon(folder: Path, scene: Scene) -> Written:
@@ -299,9 +301,9 @@ def demon(folder: Path, scene: Scene) -> Written:
 def strecha(folder: Path, scene: Scene) -> Written:
     for i, pose in enumerate(scene.world_from_cam):
         write_image(folder / "images" / f"{i:04d}.jpg", scene.images[i])
-        rows = *K, "0 0 0", *pose[:3, :3], pose[:3, 3], "64 48"
+        rows = *SKEWED, "0 0 0", *pose[:3, :3], pose[:3, 3], "64 48"
         write_text(folder / "cameras" / f"{i:04d}.jpg.camera", *rows)
-    return Written(folder, [f"{i:04d}" for i in range(NUM)], metric=False)
+    return Written(folder, [f"{i:04d}" for i in range(NUM)], metric=False, K=SKEWED)
 
 
 Writer = Callable[[Path, Scene], Written]

@@ -10,6 +10,7 @@ from written_captures import (
     CY,
     NUM,
     OPENGL,
+    SKEWED,
     F,
     Scene,
     Writer,
@@ -61,7 +62,7 @@ def scanner_app(folder: Path, scene: Scene) -> Written:
     for i, pose in enumerate(scene.world_from_cam @ OPENGL):
         camera = {
             "cameraPoseARFrame": [*pose.ravel()[:15].tolist(), 0.99999994],  # as floats are printed
-            "intrinsics": [F, 0, CX + 0.5, 0, F, CY + 0.5, 0, 0, 1],
+            "intrinsics": [F, 0.75, CX + 0.5, 0, F, CY + 0.5, 0, 0, 1],
             "projectionMatrix": [1.0] * 16,
             "frame_index": 5 * i,
             "time": 100 + i / 12,
@@ -74,7 +75,7 @@ def scanner_app(folder: Path, scene: Scene) -> Written:
             (folder / f"frame_{number:05d}.json").write_text(json.dumps(camera))
     write_image(folder / "thumb_00000.jpg", scene.images[0])
     (folder / "info.json").write_text(json.dumps({"title": "Scan"}))
-    return Written(folder, [f"frame_{5 * i:05d}" for i in range(NUM)], None, True)
+    return Written(folder, [f"frame_{5 * i:05d}" for i in range(NUM)], None, True, K=SKEWED)
 
 
 DATA_SETS: dict[str, Writer] = {

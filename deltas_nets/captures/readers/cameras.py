@@ -10,13 +10,15 @@ from deltas_nets.captures.readers.image_sizes import SizedCamera, at_size
 from deltas_nets.captures.readers.json_file import Fields
 from deltas_nets.errors import UserError
 
-__all__ = ["CORNER", "camera_matrix", "fitted", "size_of"]
+__all__ = ["CORNER", "camera_matrix", "camera_of_matrix", "fitted", "size_of"]
 
 CORNER = 0.5
 """What is subtracted from principal points of programs that put the image's corner at 0."""
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, path: Path) -> FloatArray:
+def camera_matrix(
+    fx: float, fy: float, cx: float, cy: float, *, path: Path, skew: float = 0.0
+) -> FloatArray:
     """``(3, 3)``, read-only.
 
     Args:
@@ -25,16 +27,32 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, path: Path) -> 
         cx: principal point, pixel centres at integers, as ``cy``.
         cy: see ``cx``.
         path: the file that states them, for errors.
+        skew: what a matrix holds beside fx, pixels.
 
     Raises:
         UserError: they are not finite, or a focal length is not positive.
     """
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    K = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1.0]])
     if not np.isfinite(K).all() or min(fx, fy) <= 0:
         what = f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} are no camera"
         raise UserError(what, path, "state focal lengths and principal point in pixels")
     K.setflags(write=False)
     return K
+
+
+def camera_of_matrix(matrix: FloatArray, *, path: Path, corner: float = 0.0) -> FloatArray:
+    """``(3, 3)``, read-only, of a matrix by rows that may hold more.
+
+    Args:
+        matrix: ``(3, 3)`` or ``(4, 4)``.
+        path: the file that states it, for errors.
+        corner: `CORNER` of a program that puts the image's corner at 0.
+
+    Raises:
+        UserError: as `camera_matrix`.
+    """
+    (fx, skew, cx), (_, fy, cy) = matrix[:2, :3].tolist()
+    return camera_matrix(fx, fy, cx - corner, cy - corner, path=path, skew=skew)
 
 
 def size_of(fields: Fields, height: str, width: str) -> tuple[int, int]:

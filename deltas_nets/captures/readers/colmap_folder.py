@@ -22,6 +22,8 @@ DEPTH = 3
 """Folders down to which a model of another name is searched."""
 ENTRIES_LIMIT = 200_000
 """Files and folders that are looked at to find one."""
+FOLDERS_LIMIT = 10_000
+"""Folders, as deep as each other, that are looked into."""
 
 
 class FoundModels(NamedTuple):
@@ -115,12 +117,18 @@ def _search(path: Path) -> Iterator[Path]:
     for _ in range(DEPTH):
         below: list[Path] = []
         for parent in level:
-            folders, entries = _folders_in(parent)
+            try:
+                folders, entries = _folders_in(parent)
+            except OSError:
+                if parent == path:
+                    raise
+                continue  # what is not ours to read is no part of a capture
             budget -= entries
             if budget < 0:
                 return
             below += folders
-        level = below
+        # To ask each whether it holds a model takes far longer than to list it.
+        level = below[:FOLDERS_LIMIT]
         yield from (folder for folder in level if _is_model(folder))
 
 
@@ -143,13 +151,15 @@ def _folders_in(path: Path) -> tuple[list[Path], int]:
 
 def _has_other_poses(folder: Path) -> bool:
     """Whether this is ScanNet's layout, whose poses are metric, whatever else it holds."""
-    return (folder / "pose").is_dir()
+    return os.path.isdir(
+        folder / "pose"
+    )  # unlike pathlib's, without an error where we may not look
 
 
 def _is_model(path: Path) -> bool:
     """Whether two of the three files are there: a model may lack points, or be broken or mixed."""
     kinds = (".bin", ".txt")
-    there = (any((path / f"{stem}{kind}").is_file() for kind in kinds) for stem in STEMS)
+    there = (any(os.path.isfile(path / f"{stem}{kind}") for kind in kinds) for stem in STEMS)
     return sum(there) >= 2
 
 

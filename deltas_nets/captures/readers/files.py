@@ -18,7 +18,7 @@ __all__ = ["NOT_COLOUR", "FileFinder"]
 NOT_COLOUR = ("depth", "mask", "normal", "confidence", "semantic", "segment", "preview", ".")
 """How names of folders begin in which no colour image is looked for."""
 FILES_LIMIT = 10**6
-"""Files that a folder may hold where names are searched in it."""
+"""Files and folders that a folder may hold where names are searched in it."""
 _EMPTY: frozenset[str] = frozenset()
 
 
@@ -222,9 +222,11 @@ def _walk(root: Path, avoid: tuple[str, ...], seen: set[str]) -> Iterator[tuple[
             folders.clear()
             continue
         folders[:] = sorted(name for name in folders if not name.lower().startswith(avoid))
-        count += len(files)
+        count += len(files) + len(folders)
         if count > FILES_LIMIT:
-            what = f"the folder holds more than {FILES_LIMIT} files to search for images"
+            what = (
+                f"the folder holds more than {FILES_LIMIT} files and folders to search for images"
+            )
             raise UserError(what, root, "name the folder of one capture")
         for file in sorted(files):
             yield folder, file

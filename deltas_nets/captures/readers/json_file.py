@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from deltas_nets.captures.frame import FloatArray
+from deltas_nets.captures.json_slips import slip_in_json
 from deltas_nets.captures.text_lines import decoded
 from deltas_nets.errors import UserError
 
@@ -47,6 +48,9 @@ def read_json(path: Path, *, name: str, remedy: str, limit: int = JSON_LIMIT) ->
         raise UserError(what, path, remedy) from error
     except UnicodeDecodeError as error:
         raise UserError(f"the {name} file is not text in UTF-8", path, remedy) from error
+    except json.JSONDecodeError as error:
+        slip, cure = slip_in_json(error)
+        raise UserError(f"the {name} file is not JSON ({slip})", path, cure or remedy) from error
     except ValueError as error:
         raise UserError(f"the {name} file is not JSON ({error})", path, remedy) from error
     except RecursionError as error:

@@ -12,7 +12,7 @@ from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import in_words
-from deltas_nets.captures.readers.cameras import CORNER, camera_matrix, fitted
+from deltas_nets.captures.readers.cameras import CORNER, camera_of_matrix, fitted
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.numbered import numbered_files
 from deltas_nets.captures.readers.poses import cam_from_world
@@ -107,10 +107,9 @@ def _camera(path: Path) -> _Camera:
     except ValueError as error:
         what = f"the camera holds words where numbers should be{in_commas(' '.join(words))}"
         raise UserError(what, path, _REMEDY) from error
-    fx, _, cx, _, fy, cy, *_ = intrinsic
     return _Camera(
         np.array(extrinsic).reshape(4, 4),
-        camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=path),
+        camera_of_matrix(np.array(intrinsic).reshape(3, 3), path=path, corner=CORNER),
         _depths(rest),
     )
 

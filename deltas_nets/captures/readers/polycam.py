@@ -39,6 +39,9 @@ def read(path: Path) -> Capture:
         raise UserError("there are no cameras in keyframes", path, _REMEDY)
     cameras, images = both
     folder = cameras.parent
+    if not images.is_dir():
+        what = f"the raw data has {cameras.name} and no folder of their images"
+        raise UserError(what, images, f"copy it from the export, or {_REMEDY}")
     doubts = []
     if cameras.name == "cameras":
         doubts.append(f"poses are as tracked, not optimised (no corrected_cameras), {folder}")
@@ -82,7 +85,11 @@ def _keyframes(path: Path) -> tuple[Path, Path] | None:
             both = folder / cameras, folder / images
             if both[0].is_dir() and both[1].is_dir() and _holds_json(both[0]):
                 return both
-    return None
+    alone = (path / "keyframes", *([path] if path.name == "keyframes" else []))
+    without = (
+        (folder / cameras, folder / images) for folder in alone for cameras, images in _KINDS
+    )
+    return next((both for both in without if both[0].is_dir() and _holds_json(both[0])), None)
 
 
 def _holds_json(folder: Path) -> bool:

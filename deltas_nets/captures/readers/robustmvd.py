@@ -9,7 +9,7 @@ from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.float_files import read_npy_array
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ids import natural_key
-from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.cameras import camera_of_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.poses import cam_from_world
@@ -57,7 +57,7 @@ def read(path: Path) -> Capture:
         found.add(
             photo,
             pose,
-            camera_matrix(K[0, 0], K[1, 1], K[0, 2], K[1, 2], path=folder / "K.npy"),
+            camera_of_matrix(K, path=folder / "K.npy"),
             depth=depth if depth.is_file() else None,
         )
     capture = found.capture(path, "Robust MVD", metric=True)

@@ -7,7 +7,7 @@ import numpy as np
 from deltas_nets.captures.capture import Capture, Lost
 from deltas_nets.captures.file_form import FileForm
 from deltas_nets.captures.frame import FloatArray
-from deltas_nets.captures.readers.cameras import CORNER, camera_matrix
+from deltas_nets.captures.readers.cameras import CORNER, camera_of_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.json_file import Fields, read_json
 from deltas_nets.captures.readers.numbered import numbered_files
@@ -56,10 +56,10 @@ def read(path: Path) -> Capture:
 
 def _K(fields: Fields) -> FloatArray:
     """ARKit measures the principal point from the corner of the image."""
-    (fx, _, cx), (_, fy, cy), last = fields.numbers("intrinsics", (9,)).reshape(3, 3)
-    if not np.allclose(last, (0, 0, 1), atol=_ROUNDING):
+    matrix = fields.numbers("intrinsics", (9,)).reshape(3, 3)
+    if not np.allclose(matrix[2], (0, 0, 1), atol=_ROUNDING):
         raise fields.error("has intrinsics that are not by rows, with 0 0 1 as the last")
-    return camera_matrix(fx, fy, cx - CORNER, cy - CORNER, path=fields.path)
+    return camera_of_matrix(matrix, path=fields.path, corner=CORNER)
 
 
 def _pose(fields: Fields, id: str) -> FloatArray | Lost:

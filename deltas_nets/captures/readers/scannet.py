@@ -1,5 +1,6 @@
 """ScanNet's export layout: color/N.jpg, depth/N.png, pose/N.txt, intrinsic/*.txt."""
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -161,7 +162,7 @@ def _find_files(scene: Path) -> _SceneFiles:
 
 def is_scene(path: Path) -> bool:
     """Whether the folder itself holds a scene, or the beginning of one."""
-    return any((path / name).is_dir() for name in ("color", "pose", "intrinsic"))
+    return any(os.path.isdir(path / name) for name in ("color", "pose", "intrinsic"))
 
 
 def _find_scene(path: Path) -> Path:

@@ -13,7 +13,7 @@ from deltas_nets.captures.capture import Capture, Lost
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.images import Span
-from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.cameras import camera_of_matrix
 from deltas_nets.captures.readers.listed import listed
 from deltas_nets.captures.readers.poses import cam_from_world_of, missing_images
 from deltas_nets.errors import UserError
@@ -154,7 +154,7 @@ def _header(file: BinaryIO, path: Path) -> _Header:
 
 
 def _intrinsics(matrix: FloatArray, path: Path) -> FloatArray:
-    return camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], path=path)
+    return camera_of_matrix(matrix, path=path)
 
 
 def _read(file: BinaryIO, form: str, path: Path) -> tuple[Any, ...]:

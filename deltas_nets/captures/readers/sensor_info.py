@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deltas_nets.captures.frame import FloatArray
-from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.cameras import camera_of_matrix
 from deltas_nets.captures.text_lines import read_text
 from deltas_nets.errors import UserError
 
@@ -72,7 +72,7 @@ def read_sensor_info(folder: Path) -> SensorInfo | None:
 
 def _camera(said: Mapping[str, list[str]], key: str, path: Path) -> FloatArray:
     matrix = _matrix(said, key, path)
-    return camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], path=path)
+    return camera_of_matrix(matrix, path=path)
 
 
 def _matrix(said: Mapping[str, list[str]], key: str, path: Path) -> FloatArray:

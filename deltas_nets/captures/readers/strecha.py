@@ -1,12 +1,13 @@
 """Strecha's multi-view benchmark: 0000.jpg and 0000.jpg.camera."""
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from deltas_nets.captures.capture import Capture
-from deltas_nets.captures.readers.cameras import camera_matrix
+from deltas_nets.captures.readers.cameras import camera_of_matrix
 from deltas_nets.captures.readers.collected import Collected
 from deltas_nets.captures.readers.files import FileFinder
 from deltas_nets.captures.readers.listed import listed
@@ -47,7 +48,7 @@ def read(path: Path) -> Capture:
         if not (np.isfinite(sides).all() and (sides >= 1).all()):
             raise UserError("the camera's width and height are no sizes", file, _REMEDY)
         stated = int(sides[1]), int(sides[0])
-        matrix = camera_matrix(K[0], K[4], K[2], K[5], path=file)
+        matrix = camera_of_matrix(K.reshape(3, 3), path=file)
         found.add(photo, pose, matrix, stated=stated)
     doubts = finder.doubts()
     if bent:
@@ -60,7 +61,9 @@ def _cameras(path: Path) -> Sequence[Path]:
     if not path.is_dir():
         return ()
     found = sorted(listed(path, ".camera"))
-    folders = () if found else sorted(each for each in listed(path) if each.is_dir())
-    return found or next(
-        (inside for each in folders if (inside := sorted(listed(each, ".camera")))), ()
-    )
+    for each in () if found else sorted(listed(path)):
+        with contextlib.suppress(OSError):  # no folder, or not ours to read
+            found = sorted(listed(each, ".camera"))
+        if found:
+            break
+    return found

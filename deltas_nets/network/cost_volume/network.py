@@ -57,7 +57,7 @@ class CostVolume(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = look_up("deltas_nets.network", ENCODERS[config.backbone].place)()
+        self.encoder = look_up("deltas_nets.network", ENCODERS[config.backbone].place).whole()
         channels, planes = self.encoder.channels, config.matcher.num_samples
         half, quarter, eighth, sixteenth = config.densifier_widths
         self.compared = nn.Conv2d(channels.quarter, WIDTH, 3, padding=1)

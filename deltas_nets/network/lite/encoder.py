@@ -1,6 +1,6 @@
 """What an encoder of `deltas-small`'s kind is: a pretrained trunk, and a branch of its own."""
 
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -25,6 +25,24 @@ class LiteEncoder(ImageEncoder):
 
     channels: ClassVar[Channels]
     fine: ConvBlock
+
+    @classmethod
+    def whole(cls) -> Self:
+        """A new one that states all that other stages and training ask for.
+
+        Raises:
+            TypeError: it does not.
+        """
+        cls._states(cls, channels="channels = Channels(...)", origin="origin = Origin(...)")
+        encoder = cls()
+        cls._states(encoder, fine="self.fine = self.fine_branch(), last in __init__")
+        return encoder
+
+    @classmethod
+    def _states(cls, stating: object, **lines: str) -> None:
+        for name, line in lines.items():
+            if not hasattr(stating, name):
+                raise TypeError(f"the encoder {cls.__name__} has no {name}: write {line}")
 
     @classmethod
     def fine_branch(cls) -> ConvBlock:
