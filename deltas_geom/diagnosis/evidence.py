@@ -99,12 +99,11 @@ def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHA
     """
     off = _squared(evidence, K, pose)
     rank = ((evidence.counts * share).ceil().long() - 1).clamp(min=0)
-    # Sorting all of them takes three times as long as finding them.
-    count = int(rank.max()) + 1 if rank.numel() and off.shape[-1] else 0
+    # Sorting all of them would take as long as half of the rest.
+    count = int(rank.max()) + 1 if rank.numel() else 0
     nearest = off.topk(count, largest=False).values
-    return (
-        nearest.gather(-1, rank[:, None].expand(*off.shape[:-1], 1))[..., 0].sqrt().clamp(max=CAP)
-    )
+    found = nearest.gather(-1, rank[:, None].expand(*off.shape[:-1], 1))
+    return found[..., 0].sqrt().clamp(max=CAP)
 
 
 def distances(evidence: Evidence, K: Tensor, pose: Tensor) -> Tensor:

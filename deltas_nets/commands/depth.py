@@ -113,7 +113,9 @@ class Depth(Captured, Measuring, Prediction):
         """Run the command."""
         from deltas_nets.captures.companions import companions
         from deltas_nets.captures.keyframes import keyframes
+        from deltas_nets.captures.sets_file import sets_file
         from deltas_nets.captures.usable import check_all, lone_frames, usable_view_sets, warn_of
+        from deltas_nets.captures.view_sets import read_view_sets
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
         from deltas_nets.outputs.prepare import check_place
         from deltas_nets.predict.capture import predict_capture
@@ -127,9 +129,14 @@ class Depth(Captured, Measuring, Prediction):
         self.check_measuring(predictor, capture)
         capture = self.in_metres(capture, predictor, config)
         measured = self.measured(capture)
-        # What an earlier run had otherwise is told before any look, as far as it is known by now.
+        # What is wrong is told before any look, as far as it is known by now.
         asked = asked_settings(self, capture, predictor, config)
         check_settings(self.folder, asked, capture.scaled_by, overwrite=self.overwrite)
+        if self.view_sets is not None:
+            file = sets_file(self.view_sets, capture.path)
+            read_view_sets(file, capture, allow_no_sources=self.views == 1)
+        if self.depth_range is not None and capture.metric:
+            fitting_options(options, capture, None, self.depth_scale, self.depth_range)
         depth = None
         if self.views != 1 or not capture.metric:  # nothing is searched, and no unit to be found
             depth = look_first(predictor, capture, config, self.workers, self.device)

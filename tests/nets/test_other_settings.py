@@ -97,3 +97,14 @@ def test_a_wrong_line_of_measured_depth_is_told_before_anything_is_looked_at(
     words = (*begun[:-1], "deltas-small", "--overwrite", "--sensor-depth", file)
     assert_one_line(run(*words), "line 2: pixel (300, 4) is outside of frame 0")
     assert_one_line(run(*words, "--scale-from", file), "line 2: pixel (300, 4)")
+
+
+def test_wrong_view_sets_and_steps_are_told_before_anything_is_looked_at(
+    begun: tuple[object, ...], run: Run, tmp_path: Path
+) -> None:
+    sets = tmp_path / "view_sets.json"
+    sets.write_text('[{"anchor": 77, "sources": [0]}]')
+    words = (*begun, "--overwrite")
+    assert_one_line(run(*words, "--view-sets", sets), "77")
+    assert_one_line(run(*words, "--depth-range", 1, 1000), "--depth-scale")
+    assert "looked" in run(*words, "--depth-range", 1, 1000, "--format", "npz").err
