@@ -40,10 +40,13 @@ def vectors(draw: st.DrawFn, count: int, *, within: float, size: int = 3) -> Ten
     check_counts(0, count=count)
     check_counts(1, size=size)
     check_bounds(within=within)
-    # Multiples of a 1/1024 of the bound shrink to short numbers and never underflow.
-    steps = st.integers(-1024, 1024)
-    drawn = draw(st.lists(steps, min_size=count * size, max_size=count * size))
-    return torch.tensor(drawn, dtype=torch.float64).reshape(count, size) * (within / 1024)
+    # Multiples of a 1/1024 of the bound shrink to short numbers and never underflow. Two bytes for
+    # each (0, 1, -1, 2, ...) are one draw: as many whole numbers take ten times as long.
+    drawn = draw(st.binary(min_size=2 * count * size, max_size=2 * count * size))
+    high, low = torch.tensor(list(drawn), dtype=torch.int64).reshape(count, size, 2).unbind(dim=-1)
+    place = (256 * high + low) % 2049
+    steps = (place + 1) // 2 * (2 * (place % 2) - 1)
+    return steps.double() * (within / 1024)
 
 
 @st.composite
