@@ -68,6 +68,7 @@ WRONG = [
     before("too long", "segments", lambda k, t, x, r, size: (k, t, x, (r[0] / 2, 2 * r[1]), size)),
     after("all seen", "segments", lambda a, b, s: (a, b, 0 * s)),
     after("all seen, a mask", "segments", lambda a, b, s: (a, b, s > -1)),
+    after("one for all", "segments", lambda a, b, s: (a, b, s.new_full(s.shape, int(s.max())))),
     after("none seen", "segments", lambda a, b, s: (a, b, s > 9)),
     after("empty is nan", "segments", lambda a, b, s: (a / (a != 0), b, s)),
     Target("affine", depth_samples=linear_samples),

@@ -9,6 +9,8 @@ from deltas_geom.testing.agreement import (
     assert_finite,
     assert_gradients,
     assert_near,
+    gradients,
+    slack,
 )
 from deltas_geom.testing.planar import ScoreScene
 from deltas_geom.testing.registry import invariant
@@ -74,13 +76,21 @@ def the_soft_argmax_is_finite(target: Target, scene: ScoreScene) -> None:
 
 @invariant("soft_argmax", "autograd", scenes="scores")
 def gradients_of_the_soft_argmax_are_finite_differences(target: Target, scene: ScoreScene) -> None:
-    """The gradient by logits and positions is finite and that of finite differences."""
+    """The gradient is that of finite differences, and finite where all is masked."""
 
     def mean(logits: Tensor, positions: Tensor) -> Tensor:
         return _position(target, scene._replace(logits=logits, positions=positions))
 
     inputs = [scene.logits, scene.positions]
     assert_gradients(mean, inputs, ("logits", "positions"), "(position)")
+
+    def masked(logits: Tensor, positions: Tensor) -> Tensor:
+        none = ScoreScene(logits, positions, torch.zeros_like(scene.mask))
+        found = _position(target, none)
+        return found[found.isfinite()].sum()
+
+    for gradient in gradients(masked, inputs):
+        assert_finite(gradient, "where all is masked the gradient")
 
 
 @invariant("soft_covariance", scenes="scores")
@@ -109,6 +119,10 @@ def the_covariance_does_not_know_where_it_is(
     moved = scene._replace(positions=2 * scene.positions + shift)
     found = _covariance(target, moved) / 4
     assert_near(found, wanted, VALUE_TOLERANCE * 1000, "(position squared)")
+    # Of pixels in float32, differences of squares are roundings.
+    far = ScoreScene(scene.logits.float(), (scene.positions + 1024).float(), scene.mask)
+    found = _covariance(target, far).to(wanted)
+    assert_near(found, wanted, max(2e-3 / slack(), VALUE_TOLERANCE * 1000), "(position squared)")
 
 
 @invariant("soft_covariance", scenes="scores")
