@@ -234,7 +234,7 @@ def match_joint(
 
     Returns:
         The projections of the one decided depth into the sources that can see it, weight =
-        peak of the joint distribution.
+        peak of the joint distribution. The covariance passes no gradient to the scores.
 
     Raises:
         ShapeError: scores are of other samples, or there is no source.

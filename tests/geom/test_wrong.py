@@ -66,7 +66,9 @@ FOUND = {
     ),
     "segments_are_finite": "empty is nan",
     "samples_are_seen_at_their_inverse_depths": "affine | far samples first",
-    "samples_run_from_the_far_to_the_near_end": "from near | far samples first | too wide",
+    "samples_run_from_the_far_to_the_near_end": (
+        "from near | far samples first | too wide | unclipped samples"
+    ),
     "samples_are_even_in_inverse_depth": "spacings swapped",
     "samples_are_even_in_pixels": "spacings swapped",
     "samples_are_finite": "empty samples are nan",
@@ -90,7 +92,7 @@ FOUND = {
     "gradients_of_the_soft_argmax_are_finite_differences": "logits detached",
     "the_covariance_of_a_delta_is_0": "uncentred | spread of the pixel",
     "the_covariance_of_two_places_is_their_distance": (
-        "uncentred | half the spread | spread of the pixel"
+        "uncentred | half the spread | spread of half | spread of the pixel"
     ),
     "the_covariance_does_not_know_where_it_is": "uncentred | by squares | spread of the pixel",
     "what_is_masked_has_no_spread": "spread of all | uncentred",

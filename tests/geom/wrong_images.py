@@ -110,6 +110,7 @@ WRONG = [
     Target("exp", soft_argmax=unguarded_argmax),
     Target("uncentred", soft_covariance=uncentred),
     Target("by squares", soft_covariance=by_squares),
+    before("spread of half", "soft_covariance", lambda x, p, mask: (2 * x, p, mask)),
     before("spread of all", "soft_covariance", lambda x, p, m: (x, p, torch.ones_like(m))),
     after("half the spread", "soft_covariance", lambda found: found / 2),
     after("spread of the pixel", "soft_covariance", lambda c: c + torch.eye(len(c)) / 12),

@@ -1,5 +1,7 @@
 """Invariants of soft-argmax: of places anywhere, and of the pixels of a heatmap."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -102,11 +104,12 @@ def the_covariance_of_a_delta_is_0(target: Target, scene: ScoreScene, *, place: 
 
 @invariant("soft_covariance", scenes="scores")
 def the_covariance_of_two_places_is_their_distance(target: Target, scene: ScoreScene) -> None:
-    """Half the probability in each of two places: a quarter of d d^T, d the way between them."""
+    """Three quarters and one of the probability in two places: 3/16 d d^T, d the way between."""
     pair = _certain(scene, 0)
-    pair.logits[-1, -1] = CERTAIN
+    pair.logits.sub_(CERTAIN)
+    pair.logits[-1, -1] = -math.log(3)
     way = scene.positions[-1] - scene.positions[0]
-    wanted = way[:, None] * way / 4
+    wanted = 3 / 16 * way[:, None] * way
     assert_near(_covariance(target, pair), wanted, VALUE_TOLERANCE * 100, "(position squared)")
 
 
