@@ -45,15 +45,10 @@ class EpipolarSampler(_Fixed):
 
     def forward(self, views: PosedViews, pixels: Tensor, image_size: tuple[int, int]) -> Samples:
         """Samples of the anchor's ``pixels`` (*B, N, 2) in every source."""
-        segments = epipolar_segments(
-            views, pixels, depth_range=self.depth_range, image_size=image_size
-        )
+        size, count = image_size, self.num_samples
+        found = epipolar_segments(views, pixels, depth_range=self.depth_range, image_size=size)
         return sample_segments(
-            segments,
-            self.num_samples,
-            spacing=self.spacing,
-            offsets=self.offsets,
-            image_size=image_size,
+            found, count, spacing=self.spacing, offsets=self.offsets, image_size=size
         )
 
 

@@ -33,13 +33,7 @@ def with_one(coordinates: Tensor) -> Tensor:
 
 
 def safe_divide(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
-    """``numerator / denominator`` where ``where`` holds, elsewhere 0 with zero gradient.
-
-    Args:
-        numerator: any shape that broadcasts with the denominator.
-        denominator: not zero where ``where`` holds.
-        where: bool, of a shape that broadcasts to that of the quotient.
-    """
+    """``numerator / denominator`` where ``where`` holds, elsewhere 0 with zero gradient."""
     known = unless_all(where)
     # Double where: the unused branch must not turn the gradient into NaN.
     return only(numerator / only(denominator, known, other=1.0), known)

@@ -46,6 +46,7 @@ def in_image(pixels: Tensor, *, image_size: tuple[int, int], border: float = 0.0
         ``(*B)`` bool.
     """
     check_shapes(pixels=(pixels, "2"))
+    check_image_size(image_size)
     height, width = image_size
     x, y = pixels.unbind(dim=-1)
     low = border - 0.5
@@ -90,6 +91,7 @@ def read_map(
 
 def normalizing(image_size: tuple[int, int], *, like: Tensor) -> tuple[Tensor, Tensor]:
     """What :func:`normalize_pixels` gives to pixel (0, 0), and its slope, each ``(2,)``."""
+    check_image_size(image_size)
     # What a mode of torch makes, as a fake tensor, is not to be kept.
     if values_at_hand(like) and torch._C._len_torch_dispatch_stack() == 0:
         return _kept_normalizing(*image_size, like.device, like.dtype)

@@ -11,7 +11,7 @@ from deltas_geom.cameras.pixels import crop_intrinsics, resize_intrinsics
 from deltas_geom.cameras.posed_shapes import posed_shapes
 from deltas_geom.cameras.poses import invert_pose, is_rigid, recentred
 from deltas_geom.cameras.pytorch3d import from_pytorch3d
-from deltas_geom.checks import ShapeError, check_kind, check_tensor
+from deltas_geom.checks import ShapeError, check_image_size, check_kind, check_tensor
 from deltas_geom.numerics.arithmetic import (
     both,
     finite_or_zero,
@@ -173,6 +173,7 @@ class PosedViews(Record):
         Raises:
             ShapeError: K and cam_from_world do not go together.
         """
+        check_image_size(image_size)
         batch = self.check_shapes()
         K, cam_from_world = (
             # The count, not -1: a reshape of nothing cannot infer it.

@@ -49,8 +49,8 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
 
     Returns:
         ``(*B, 3, 3)``, F = K_s^-T [t]x R K_a^-1, not normalised: its scale follows the
-        baseline, and at zero baseline it is zero, as with a camera that is not finite, then
-        without gradient. At least float32.
+        baseline, and at zero baseline, within rounding, it is zero, as with a camera that is not
+        finite, then without gradient. At least float32.
 
     Raises:
         ShapeError: shapes of the cameras do not go together.
@@ -62,7 +62,14 @@ def fundamental_between(views: PosedViews, anchor: int = 0, source: int = 1) -> 
     K, cam_from_world = promoted(*cameras)
     anchor_from_world, source_from_world = (cam_from_world[..., v, :, :] for v in (anchor, source))
     source_from_anchor = source_from_world @ inverse_of_finite(anchor_from_world)
-    essential = cross_matrix(source_from_anchor[..., :3, 3]) @ source_from_anchor[..., :3, :3]
+    baseline = source_from_anchor[..., :3, 3]
+    with outside_gradients():
+        # Of one centre the product of two poses leaves roundings, whose lines would look sound.
+        ends = anchor_from_world[..., :3, 3].abs() + source_from_world[..., :3, 3].abs()
+        noise = 8 * torch.finfo(K.dtype).eps * ends.amax(dim=-1, keepdim=True)
+        none = (baseline.abs() <= noise).all(dim=-1, keepdim=True)
+        rounding = torch.where(none, baseline.detach(), 0.0)
+    essential = cross_matrix(baseline - rounding) @ source_from_anchor[..., :3, :3]
     K_anchor, K_source = K[..., anchor, :, :], K[..., source, :, :]
     fundamental = inverse_intrinsics(K_source).mT @ essential @ inverse_intrinsics(K_anchor)
     if finite is None:

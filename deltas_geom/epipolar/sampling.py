@@ -9,7 +9,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.pixels import in_image, read_map
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_batch, check_image_size, check_kind, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_kind, check_shapes
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
@@ -128,7 +128,6 @@ def sample_segments(
     mask = only(segments.visible.unsqueeze(-1), sound, other=False)
     mask = mask.unsqueeze(-1).expand(pixels.shape[:-1])
     if image_size is not None:
-        check_image_size(image_size)
         mask = mask & in_image(pixels, image_size=image_size)
     return Samples(pixels, inv_depth, mask)
 
@@ -153,7 +152,6 @@ def sample_inv_depths(
     Raises:
         ShapeError: a trailing shape differs.
     """
-    check_image_size(image_size)
     check_shapes(pixels=(pixels, "N 2"), inv_depths=(inv_depths, "S"))
     rays = epipolar_rays(views, pixels)
     inv_depths, known = finite_or_zero(inv_depths, dims=0)

@@ -119,14 +119,8 @@ def matches_from_sources(
 ) -> Matches:
     """Put the anchor's keypoints (weight 1, no covariance) before the sources' matches.
 
-    A keypoint that is not finite is no match.
-
-    Args:
-        keypoints: ``(*B, N, 2)``.
-        pixels: ``(*B, V-1, N, 2)``.
-        weights: ``(*B, V-1, N)``.
-        covariance: ``(*B, V-1, N, 2, 2)``.
-        mask: ``(*B, V-1, N)``.
+    A keypoint ``(*B, N, 2)`` that is not finite is no match. The others are as in a record of
+    matches, but of V-1 views.
     """
     batch = batch_shape(keypoints.shape[:-2], weights.shape[:-2])
     keypoints, known = finite_or_zero(keypoints)
@@ -240,7 +234,7 @@ def match_joint(
 
     Returns:
         The projections of the one decided depth into the sources that can see it, weight =
-        peak of the joint distribution.
+        peak of the joint distribution. The covariance passes no gradient to the scores.
 
     Raises:
         ShapeError: scores are of other samples, or there is no source.

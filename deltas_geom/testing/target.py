@@ -26,6 +26,8 @@ _MADE_OF = {
     "autograd": "differentiable=True",
     "gradients": "triangulate and differentiable=True",
     "batches": "triangulate and batched=True",
+    "points": "triangulate, refine or robust",
+    "fit": "refine or robust",
     "many views": f"max_views of 3 or more, or None, and {_SOLVERS}",
     "samples": "depth_samples or pixel_samples",
     "drawing": "rasterize, mean_depth or splat",
@@ -166,8 +168,9 @@ class Target:
         Args:
             feature: the name of a function above, or of what goes with some of them: "weights"
                 and "many views" (three and more) of what has points and pixels, "gradients" and
-                "batches" of triangulation, "autograd" of anything, "samples" (of either spacing),
-                "drawing" (of depth, in any of three ways).
+                "batches" of triangulation, "points" (found in any of three ways), "fit" (in two),
+                "autograd" of anything, "samples" (of either spacing), "drawing" (of depth, in any
+                of three ways).
         """
         solves = any((self.triangulate, self.judge, self.refine, self.residual, self.robust))
         more = {
@@ -176,6 +179,8 @@ class Target:
             "gradients": self.triangulate is not None and self.differentiable,
             "batches": self.triangulate is not None and self.batched,
             "many views": solves and (self.max_views is None or self.max_views >= 3),
+            "points": any((self.triangulate, self.refine, self.robust)),
+            "fit": any((self.refine, self.robust)),
             "samples": self.depth_samples is not None or self.pixel_samples is not None,
             "drawing": any((self.rasterize, self.mean_depth, self.splat)),
         }

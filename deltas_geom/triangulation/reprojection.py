@@ -81,7 +81,7 @@ def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
     tiny = torch.finfo(x.dtype).tiny ** 0.5
     inverse = torch.rsqrt(torch.addcmul(torch.addcmul(x * x, y, y), z, z).clamp(min=tiny))
     x, y, z = x * inverse, y * inverse, z * inverse
-    chord = torch.zeros_like(x[..., 0, :])
+    chord = torch.zeros_like(x[..., 0, :] * used[..., 0, :])
     everywhere = surely_all(used > 0)
     for first in range(x.shape[-2] - 1):
         one, rest = slice(first, first + 1), slice(first + 1, None)

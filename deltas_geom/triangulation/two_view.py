@@ -253,9 +253,14 @@ def _judged(seen: _Seen) -> tuple[_Solved, Tensor]:
     length = centers.diff(dim=-2).norm(dim=-1) * exist
     size = centers.norm(dim=-1).amax(dim=-1)[..., None]
     # Centres closer together than the rounding of where they are do not differ. On the baseline
-    # both rays pass the other camera within rounding.
+    # both rays pass the other camera within rounding: as given, since there a correction may be
+    # the root of a rounding.
+    given = product(seen.cameras.inverse[..., :2], seen.xy) + seen.cameras.inverse[..., 2:]
+    given = given / _safe(given.abs().amax(dim=-2)).unsqueeze(-2)
+    across = _cross(centers.diff(dim=-2)[..., None].unbind(dim=-2), given.unbind(dim=-2))
+    aside = dot(across, across).amax(dim=-2)
+    posed = (length > 128 * eps * size) & (aside > (8 * eps * (size + length)).square())
     farther = solved.beside.amax(dim=-2)
-    posed = (length > 128 * eps * size) & (farther > 8 * eps * (size + length))
     # The law of sines: the baseline and a distance, without the point, which may be anywhere.
     near = solved.sine * length > 32 * eps * farther
     near = near & solved.points.to(seen.dtype).isfinite().all(dim=-2)

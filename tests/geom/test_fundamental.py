@@ -141,10 +141,19 @@ def test_gradients_are_right() -> None:
     assert torch.autograd.gradcheck(distances, (K, pose, scene.pixels.clone().requires_grad_()))
 
 
-@given(pixels=image_pixels(4))
-def test_without_a_baseline_there_are_no_lines(pixels: Tensor) -> None:
-    fundamental = fundamental_between(zero_baseline().views).requires_grad_()
-    lines = epipolar_lines(fundamental, pixels)
+@given(pixels=image_pixels(4), turn=vectors(1, within=3.0), shift=vectors(1, within=100.0))
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
+def test_without_a_baseline_there_are_no_lines_wherever_the_origin_is(
+    kind: torch.dtype, pixels: Tensor, turn: Tensor, shift: Tensor
+) -> None:
+    K, poses = zero_baseline().views
+    views = PosedViews(K, poses @ rigid(turn, shift)).to(kind)
+    moving = views.cam_from_world.clone().requires_grad_()
+    fundamental = fundamental_between(views._replace(cam_from_world=moving))
+    assert (fundamental == 0).all()
+    assert torch.autograd.grad(fundamental.sum(), moving)[0].any()
+    fundamental = fundamental.detach().requires_grad_()
+    lines = epipolar_lines(fundamental, pixels.to(kind))
     assert (lines == 0).all()
     assert (torch.autograd.grad(lines.sum(), fundamental)[0] == 0).all()
 

@@ -221,6 +221,16 @@ def test_a_pixel_on_its_epipole_shows_the_other_camera(angle: float, view: int) 
     assert (result.status == Status.BEHIND_CAMERA).all()
 
 
+@given(turn=vectors(1, within=3.0), shift=vectors(1, within=30.0))
+def test_on_the_baseline_there_is_no_parallax_wherever_the_origin_is(
+    turn: Tensor, shift: Tensor
+) -> None:
+    views, _, pixels = on_baseline()
+    moved = PosedViews(views.K, views.cam_from_world @ rigid(turn, shift))
+    result = triangulate_two_view(moved.proj, pixels)
+    assert (result.status == Status.NO_PARALLAX).all()
+
+
 def test_a_masked_pixel_may_hold_anything() -> None:
     scene = forward_motion()
     pixels = scene.pixels.clone()

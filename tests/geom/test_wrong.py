@@ -28,7 +28,9 @@ FOUND = {
     "pixels_are_those_of_the_camera_equations": "projected at 0.5 | whole mm",
     "pixels_do_not_know_the_worlds_frame": "whole mm",
     "pixels_follow_a_crop_and_a_resize": "projected at 0.5",
-    "gradients_of_pixels_are_finite_differences": "half the gradient | whole mm",
+    "gradients_of_pixels_are_finite_differences": (
+        "half the gradient | whole mm | unguarded | guarded once"
+    ),
     "pixels_are_finite": "unguarded",
     "a_pixel_with_its_depth_is_its_point": "world_from_cam | along the ray | unprojected at 0.5",
     "unprojected_points_move_with_the_world": "world_from_cam",
@@ -47,7 +49,9 @@ FOUND = {
     "every_visible_depth_lies_on_the_segment": (
         "ends at 0.5 | ends y, x | dropped | both sides | not so near | none seen"
     ),
-    "a_segment_out_of_sight_is_flagged": "unclipped | both sides | all seen | all seen, a mask",
+    "a_segment_out_of_sight_is_flagged": (
+        "unclipped | both sides | all seen | all seen, a mask | one for all"
+    ),
     "without_a_baseline_a_segment_is_a_point": (
         "ends at 0.5 | ends y, x | both sides | all seen | none seen"
     ),
@@ -57,11 +61,14 @@ FOUND = {
     "segments_do_not_know_the_worlds_frame": "not so near",
     "segments_follow_a_resize": "ends at 0.5 | ends y, x | unclipped",
     "a_crop_of_the_source_clips_segments": (
-        "ends at 0.5 | ends y, x | unclipped | dropped | both sides | all seen | all seen, a mask"
+        "ends at 0.5 | ends y, x | unclipped | dropped | both sides | all seen | "
+        "all seen, a mask | one for all"
     ),
     "segments_are_finite": "empty is nan",
     "samples_are_seen_at_their_inverse_depths": "affine | far samples first",
-    "samples_run_from_the_far_to_the_near_end": "from near | far samples first | too wide",
+    "samples_run_from_the_far_to_the_near_end": (
+        "from near | far samples first | too wide | unclipped samples"
+    ),
     "samples_are_even_in_inverse_depth": "spacings swapped",
     "samples_are_even_in_pixels": "spacings swapped",
     "samples_are_finite": "empty samples are nan",
@@ -76,7 +83,7 @@ FOUND = {
     "reading_is_linear_in_the_map": "clamped | brighter to the right",
     "gradients_of_what_is_read_are_finite_differences": "places detached",
     "what_is_read_is_finite": "unbounded",
-    "correlating_is_reading_and_multiplying": "cosine",
+    "correlating_is_reading_and_multiplying": "cosine | scaled scores",
     "the_soft_argmax_is_the_mean_under_the_softmax": "half as warm | argmax + 1e-3 | no mask",
     "the_soft_argmax_of_a_delta_is_the_delta": "argmax + 1e-3 | exp",
     "the_soft_argmax_moves_with_the_positions": "argmax + 1e-3",
@@ -85,9 +92,9 @@ FOUND = {
     "gradients_of_the_soft_argmax_are_finite_differences": "logits detached",
     "the_covariance_of_a_delta_is_0": "uncentred | spread of the pixel",
     "the_covariance_of_two_places_is_their_distance": (
-        "uncentred | half the spread | spread of the pixel"
+        "uncentred | half the spread | spread of half | spread of the pixel"
     ),
-    "the_covariance_does_not_know_where_it_is": "uncentred | spread of the pixel",
+    "the_covariance_does_not_know_where_it_is": "uncentred | by squares | spread of the pixel",
     "what_is_masked_has_no_spread": "spread of all | uncentred",
     "the_soft_argmax_of_a_heatmap_peak_is_its_pixel": (
         "heatmap y, x | heatmap from the corner | heatmap normalised"
@@ -109,7 +116,7 @@ FOUND = {
         "weights ignored | weights ignored, pair | weights not squared | weights plus 0.1 | "
         "1 mm off | pixels stretched"
     ),
-    "a_batch_of_scenes_is_solved_as_each_alone": "first of batch",
+    "a_batch_of_scenes_is_solved_as_each_alone": "first of batch | first camera of batch",
     "float32_is_as_good_as_rounding_the_input": "float16",
     "gradients_are_finite_differences": "no gradient",
     "gradients_are_finite_differences_at_ties": "no gradient | svd | normal equations",
@@ -128,15 +135,24 @@ FOUND = {
     "an_exact_point_has_no_residual": "residual at 0.5",
     "the_residual_is_the_rms_distance_in_pixels": "in slopes | mean | algebraic | residual at 0.5",
     "the_residual_does_not_know_the_worlds_frame": "algebraic",
-    "the_parallax_is_the_largest_angle_between_rays": "degrees | baseline",
+    "the_parallax_is_the_largest_angle_between_rays": (
+        "degrees | baseline | from the first | acute"
+    ),
     "the_parallax_does_not_know_the_worlds_frame": "baseline",
     "where_no_view_is_wrong_all_are_inliers": "none right | robust, 1 mm off",
     "a_wrong_view_does_not_move_a_robust_point": (
         "all views | no second look | none right | robust, 1 mm off"
     ),
     "a_view_of_weight_0_does_not_move_a_robust_point": "robust, no weights | robust, 1 mm off",
-    "inliers_are_within_the_threshold": "all views",
+    "inliers_are_within_the_threshold": "all views | squared px",
     "robust_points_move_with_the_world": "robust, 1 mm off",
+    "a_pixel_that_is_nan_moves_no_other_point": (
+        "weights ignored | weights plus 0.1 | spread | all or nothing | svd | normal equations | "
+        "robust, no weights"
+    ),
+    "no_point_beside_fits_better": (
+        "overshot | no step | random walk | robust, no weights | any weight | robust, 1 mm off"
+    ),
     "the_nearest_point_wins": (
         "last wins | farthest wins | floor | onto the edge | into the next row | depth y, x"
     ),
@@ -144,7 +160,9 @@ FOUND = {
     "a_splat_keeps_weight_depth_and_place": "splat from the corner | lost weight | nearest splat",
     "the_order_of_points_does_not_count": "last wins | no depth is nan",
     "a_point_at_a_pixels_centre_goes_there": "depth y, x | splat from the corner",
-    "points_outside_leave_no_trace": "onto the edge | into the next row | no depth is nan",
+    "points_outside_leave_no_trace": (
+        "onto the edge | into the next row | nan at 0 | no depth is nan"
+    ),
     "depths_that_are_none_leave_no_trace": "unguarded mean | no depth is nan",
     "depth_images_are_finite": "no depth is nan",
 }
@@ -191,7 +209,7 @@ def test_half_a_pixel_is_found(feature: str) -> None:
     assert failures(before("0.5", feature, lambda proj, x, *others: (proj, x + 0.5, *others)))
 
 
-FEATURES = {"unproject", "rays", "residual", "parallax", "robust"}
+FEATURES = {"unproject", "rays", "residual", "parallax", "robust", "points", "fit"}
 OF_CAMERAS = [name for name, each in INVARIANTS.items() if FEATURES & {*each.needs}]
 
 

@@ -1,12 +1,14 @@
 """Arguments of any operation that are empty or of a wrong kind: an answer or an error in words."""
 
+import inspect
 import re
 from collections.abc import Callable
 from typing import Any
 
+import operations
 import pytest
 import torch
-from operations import OPERATIONS, RANGE, SIZE, at_depths, chosen, inputs_in
+from operations import METHODS, OPERATIONS, RANGE, SIZE, at_depths, chosen, inputs_in
 from torch import Tensor
 
 import deltas_geom as geom
@@ -87,6 +89,25 @@ def test_without_places_or_pixels_of_a_map_there_is_an_error_in_words() -> None:
     given = chosen(OPERATIONS["correlate"], inputs_in(torch.float32))
     with pytest.raises(geom.ShapeError, match="feature_map must have w >= 1"):
         OPERATIONS["correlate"](**given | {"maps": given["maps"][..., :0]})
+
+
+SIZED = {
+    name: operation
+    for name, operation in (OPERATIONS | METHODS).items()
+    if "image_size" in inspect.signature(getattr(geom, name.split(",")[0], chosen)).parameters
+    or name in ("EpipolarSampler", "DepthRasterizer", "kornia", "from_pytorch3d", "resize")
+    or name in ("resize_intrinsics", "resize_pixels")
+}
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_a_size_that_is_none_is_an_error_in_words(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for size, kind in (((0, 5), ValueError), ((4.5, 6.0), TypeError), (7, ValueError)):
+        monkeypatch.setattr(operations, "SIZE", size)
+        with pytest.raises(kind, match=r"^image_size must "):
+            SIZED[name](**chosen(SIZED[name], ALL_INPUTS))
 
 
 def masked_soft_argmax(weights: Tensor, pixels: Tensor, mask: Tensor) -> Any:

@@ -47,6 +47,17 @@ def baseline(proj: Tensor, points: Tensor) -> Tensor:
     return (centers[1:] - centers[:1]).norm(dim=-1).amax().expand(len(points))
 
 
+def from_the_first(proj: Tensor, points: Tensor) -> Tensor:
+    pairs = [ours("parallax")(proj[[0, view]], points) for view in range(1, len(proj))]
+    return torch.stack(pairs).amax(dim=0)
+
+
+def guarded_once(K: Tensor, cam_from_world: Tensor, points: Tensor) -> Tensor:
+    """The branch that is not taken still divides by 0, and so does its gradient."""
+    seen = seen_in(PosedViews(K, cam_from_world).proj, points)
+    return torch.where(seen[..., 2:] > 1e-9, seen[..., :2] / seen[..., 2:], 0.0).clamp(max=1e30)
+
+
 def fundamental_of_a_first_view_at_the_origin(K: Tensor, cam_from_world: Tensor) -> Tensor:
     essential = cross_matrix(cam_from_world[1, :3, 3]) @ cam_from_world[1, :3, :3]
     return inverse_intrinsics(K[1]).mT @ essential @ inverse_intrinsics(K[0])
@@ -56,6 +67,7 @@ WRONG = [
     after("projected at 0.5", "project", lambda x: x + 0.5),
     before("whole mm", "project", lambda k, t, x: (k, t, (1e3 * x).round() / 1e3)),
     Target("unguarded", project=unguarded_pixels),
+    Target("guarded once", project=guarded_once),
     before("world_from_cam", "unproject", lambda k, t, x, z: (k, invert_pose(t), x, z)),
     before("unprojected at 0.5", "unproject", lambda k, t, x, z: (k, t, x + 0.5, z)),
     Target("along the ray", unproject=along_the_ray),
@@ -77,4 +89,6 @@ WRONG = [
     before("residual at 0.5", "residual", lambda p, x, points, w: (p, x + 0.5, points, w)),
     after("degrees", "parallax", torch.rad2deg),
     Target("baseline", parallax=baseline),
+    Target("from the first", parallax=from_the_first),
+    after("acute", "parallax", lambda angle: torch.minimum(angle, torch.pi - angle)),
 ]

@@ -31,6 +31,14 @@ def uncentred(x: Tensor, p: Tensor, mask: Tensor) -> Tensor:
     return (share[:, None] * p).mT @ p
 
 
+def by_squares(x: Tensor, p: Tensor, mask: Tensor) -> Tensor:
+    """The mean of squares minus the square of the mean, which are alike far from the origin."""
+    share = torch.where(mask, x, -torch.inf).softmax(dim=-1)
+    p = torch.where(mask[:, None], p, 0.0)
+    mean = share @ p
+    return (share[:, None] * p).mT @ p - mean[:, None] * mean
+
+
 def in_order(p: Tensor, z: Tensor, size: ImageSize) -> Tensor:
     """The last point wins, as a plain assignment does."""
     image = torch.zeros(size, dtype=z.dtype)
@@ -94,12 +102,15 @@ WRONG = [
         sample_map=OURS.sample_map,
         correlate=lambda d, m, x, size: ours("correlate")(F.normalize(d, dim=-1), m, x, size),
     ),
+    after("scaled scores", "correlate", lambda scores: scores / 2**0.5),
     before("half as warm", "soft_argmax", lambda x, p, mask: (2 * x, p, mask)),
     after("argmax + 1e-3", "soft_argmax", lambda found: 1.001 * found),
     before("no mask", "soft_argmax", lambda x, p, mask: (x, p, torch.ones_like(mask))),
     before("logits detached", "soft_argmax", lambda x, p, mask: (x.detach(), p, mask)),
     Target("exp", soft_argmax=unguarded_argmax),
     Target("uncentred", soft_covariance=uncentred),
+    Target("by squares", soft_covariance=by_squares),
+    before("spread of half", "soft_covariance", lambda x, p, mask: (2 * x, p, mask)),
     before("spread of all", "soft_covariance", lambda x, p, m: (x, p, torch.ones_like(m))),
     after("half the spread", "soft_covariance", lambda found: found / 2),
     after("spread of the pixel", "soft_covariance", lambda c: c + torch.eye(len(c)) / 12),
@@ -122,6 +133,7 @@ WRONG = [
     before("floor", "rasterize", lambda p, z, size: (p - 0.5, z, size)),
     Target("onto the edge", rasterize=onto_the_edge),
     Target("into the next row", rasterize=into_the_next_row),
+    before("nan at 0", "rasterize", lambda p, z, size: (p.nan_to_num(), z, size)),
     before("depth y, x", "rasterize", lambda p, z, size: (p.flip(-1), z, size)),
     before("mean of all", "mean_depth", lambda p, z, w, size: (p, z, torch.ones_like(w), size)),
     Target("unguarded mean", mean_depth=unguarded_mean),

@@ -50,6 +50,12 @@ def linear_samples(*given: Any) -> Ends:
     return along[:, :1] * (1 - share) + along[:, -1:] * share, inv_depth, status
 
 
+def unclipped_samples(*given: Any) -> Ends:
+    *cameras, size, count = given
+    along, inv_depth, _ = ours("depth_samples")(*cameras, (100 * size[0], 100 * size[1]), count)
+    return along, inv_depth, ours("depth_samples")(*given)[2]
+
+
 def no_infinity(K: Tensor, pose: Tensor, pixels: Tensor, w: Tensor, size: ImageSize) -> Any:
     found, visible = ours("sweep")(K, pose, pixels, w, size)
     return torch.where((w > 0)[:, None], found, torch.nan), visible
@@ -68,9 +74,11 @@ WRONG = [
     before("too long", "segments", lambda k, t, x, r, size: (k, t, x, (r[0] / 2, 2 * r[1]), size)),
     after("all seen", "segments", lambda a, b, s: (a, b, 0 * s)),
     after("all seen, a mask", "segments", lambda a, b, s: (a, b, s > -1)),
+    after("one for all", "segments", lambda a, b, s: (a, b, s.new_full(s.shape, int(s.max())))),
     after("none seen", "segments", lambda a, b, s: (a, b, s > 9)),
     after("empty is nan", "segments", lambda a, b, s: (a / (a != 0), b, s)),
     Target("affine", depth_samples=linear_samples),
+    Target("unclipped samples", depth_samples=unclipped_samples),
     Target("spacings swapped", depth_samples=OURS.pixel_samples, pixel_samples=OURS.depth_samples),
     after("from near", "depth_samples", lambda x, w, s: (x.flip(1), w.flip(1), s)),
     after("far samples first", "pixel_samples", lambda x, w, s: (x, w + 1, s)),

@@ -49,6 +49,10 @@ def first_of_batch(proj: Tensor, pixels: Tensor, weights: Tensor | None) -> Tens
     return found[..., :1, :, :].expand_as(found) if found.dim() > 2 else found
 
 
+def first_camera_of_batch(proj: Tensor, pixels: Tensor, weights: Tensor | None) -> Tensor:
+    return triangulate_points(proj[:1].expand_as(proj) if proj.dim() > 3 else proj, pixels, weights)
+
+
 def in_half(proj: Tensor, pixels: Tensor, weights: Tensor | None) -> Tensor:
     found = triangulate_points(proj, pixels, weights)
     return found.half().float() if found.dtype == torch.float32 else found
@@ -61,6 +65,11 @@ def any_weight(proj: Tensor, x: Tensor, w: Tensor | None) -> Tensor:
 
 def overshot(proj: Tensor, x: Tensor, points: Tensor, w: Tensor | None) -> Tensor:
     return points + 2.5 * (ours("refine")(proj, x, points, w) - points)
+
+
+def all_or_nothing(proj: Tensor, pixels: Tensor, w: Tensor | None) -> Tensor:
+    points = triangulate_points(proj, pixels, w)
+    return points / bool(pixels.isfinite().all())
 
 
 Robust = tuple[Tensor, Tensor]
@@ -87,7 +96,9 @@ WRONG = [
     points("first view twice", first_view_counts_twice),
     points("spread", spread),
     points("first of batch", first_of_batch, batched=True),
+    points("first camera of batch", first_camera_of_batch, batched=True),
     points("float16", in_half),
+    points("all or nothing", all_or_nothing),
     after("no gradient", "triangulate", lambda points: points.detach() + 0 * points),
     Target("svd", triangulate=svd_points),
     Target("normal equations", triangulate=normal_equations),
@@ -97,10 +108,13 @@ WRONG = [
     after("all or none", "judge", lambda status: status.max().expand_as(status)),
     Target("weights not judged", judge=any_weight),
     Target("overshot", refine=overshot),
+    Target("no step", refine=lambda proj, x, points, w: points.clone()),
     Target("random walk", refine=lambda proj, x, points, w: points + 1e-4),
     Target("all views", robust=all_views),
     Target("no second look", robust=strict),
     before("robust, no weights", "robust", lambda p, x, w, limit: (p, x, None, limit)),
+    before("squared px", "robust", lambda p, x, w, limit: (p, x, w, limit**0.5)),
+    before("any weight", "robust", lambda p, x, w, limit: (p, x, (w > 0).to(p), limit)),
     after("none right", "robust", lambda points, inliers: (points, inliers & False)),
     after("robust, 1 mm off", "robust", lambda points, inliers: (points + 1e-3, inliers)),
 ]

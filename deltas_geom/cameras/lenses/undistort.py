@@ -169,7 +169,7 @@ def _remapped(
     mask = valid.expand(*batch, valid.shape[-1]).reshape(*batch, 1, *new_size)
     image = read.reshape(*batch, image.shape[-3], *new_size)
     new_K, _ = finite_or_zero(new_K, dims=2)
-    return only(image, mask), new_K, mask
+    return only(image, mask), new_K.expand(*batch, 3, 3), mask
 
 
 @without_gradients

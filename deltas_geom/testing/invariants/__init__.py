@@ -16,6 +16,7 @@ from deltas_geom.testing.invariants import (
     refinement,
     residual,
     robust,
+    points,
     rasterize,
 )
 
@@ -34,6 +35,7 @@ __all__ = [
     "first_views",
     "fundamental",
     "matching",
+    "points",
     "projection",
     "rasterize",
     "reading",

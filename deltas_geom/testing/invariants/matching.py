@@ -1,5 +1,7 @@
 """Invariants of soft-argmax: of places anywhere, and of the pixels of a heatmap."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,8 @@ from deltas_geom.testing.agreement import (
     assert_finite,
     assert_gradients,
     assert_near,
+    gradients,
+    slack,
 )
 from deltas_geom.testing.planar import ScoreScene
 from deltas_geom.testing.registry import invariant
@@ -74,13 +78,21 @@ def the_soft_argmax_is_finite(target: Target, scene: ScoreScene) -> None:
 
 @invariant("soft_argmax", "autograd", scenes="scores")
 def gradients_of_the_soft_argmax_are_finite_differences(target: Target, scene: ScoreScene) -> None:
-    """The gradient by logits and positions is finite and that of finite differences."""
+    """The gradient is that of finite differences, and finite where all is masked."""
 
     def mean(logits: Tensor, positions: Tensor) -> Tensor:
         return _position(target, scene._replace(logits=logits, positions=positions))
 
     inputs = [scene.logits, scene.positions]
     assert_gradients(mean, inputs, ("logits", "positions"), "(position)")
+
+    def masked(logits: Tensor, positions: Tensor) -> Tensor:
+        none = ScoreScene(logits, positions, torch.zeros_like(scene.mask))
+        found = _position(target, none)
+        return found[found.isfinite()].sum()
+
+    for gradient in gradients(masked, inputs):
+        assert_finite(gradient, "where all is masked the gradient")
 
 
 @invariant("soft_covariance", scenes="scores")
@@ -92,11 +104,12 @@ def the_covariance_of_a_delta_is_0(target: Target, scene: ScoreScene, *, place: 
 
 @invariant("soft_covariance", scenes="scores")
 def the_covariance_of_two_places_is_their_distance(target: Target, scene: ScoreScene) -> None:
-    """Half the probability in each of two places: a quarter of d d^T, d the way between them."""
+    """Three quarters and one of the probability in two places: 3/16 d d^T, d the way between."""
     pair = _certain(scene, 0)
-    pair.logits[-1, -1] = CERTAIN
+    pair.logits.sub_(CERTAIN)
+    pair.logits[-1, -1] = -math.log(3)
     way = scene.positions[-1] - scene.positions[0]
-    wanted = way[:, None] * way / 4
+    wanted = 3 / 16 * way[:, None] * way
     assert_near(_covariance(target, pair), wanted, VALUE_TOLERANCE * 100, "(position squared)")
 
 
@@ -109,6 +122,10 @@ def the_covariance_does_not_know_where_it_is(
     moved = scene._replace(positions=2 * scene.positions + shift)
     found = _covariance(target, moved) / 4
     assert_near(found, wanted, VALUE_TOLERANCE * 1000, "(position squared)")
+    # Of pixels in float32, differences of squares are roundings.
+    far = ScoreScene(scene.logits.float(), (scene.positions + 1024).float(), scene.mask)
+    found = _covariance(target, far).to(wanted)
+    assert_near(found, wanted, max(2e-3 / slack(), VALUE_TOLERANCE * 1000), "(position squared)")
 
 
 @invariant("soft_covariance", scenes="scores")

@@ -12,6 +12,7 @@ from deltas_geom.testing.agreement import (
     assert_finite,
     assert_gradients,
     assert_near,
+    gradients,
 )
 from deltas_geom.testing.changes import ELSEWHERE, World, cut, transformed
 from deltas_geom.testing.registry import invariant
@@ -55,14 +56,23 @@ def pixels_follow_a_crop_and_a_resize(
 
 @invariant("project", "autograd")
 def gradients_of_pixels_are_finite_differences(target: Target, scene: PosedScene) -> None:
-    """The gradient by points, K and poses is finite and that of finite differences."""
+    """The gradient by points, K and poses is that of finite differences, and finite everywhere."""
     views = scene.views
 
     def see(points: Tensor, K: Tensor, pose: Tensor) -> Tensor:
         return _pixels(target, views._replace(K=K, cam_from_world=pose), points)
 
     inputs = [scene.points, views.K, views.cam_from_world]
-    assert_gradients(see, inputs, ("points", "K", "cam_from_world"), "px")
+    names = ("points", "K", "cam_from_world")
+    assert_gradients(see, inputs, names, "px")
+    inputs[0] = torch.cat([scene.points, camera_centers(views.cam_from_world)])
+
+    def loss(*inputs: Tensor) -> Tensor:
+        pixels = see(*inputs)
+        return pixels[pixels.isfinite()].sum()
+
+    for name, gradient in zip(names, gradients(loss, inputs), strict=True):
+        assert_finite(gradient, f"in a camera's centre the gradient by {name}")
 
 
 @invariant("project", scenes="named")

@@ -34,15 +34,13 @@ def the_mean_is_weighted(target: Target, scene: DepthScene) -> None:
 
 @invariant("splat", scenes="depths")
 def a_splat_keeps_weight_depth_and_place(target: Target, scene: DepthScene) -> None:
-    """Summed weights, weighted depths and the weighted mean pixel of inner points are kept."""
-    inner = scene._replace(pixels=_inner(scene))
-    depth, weight = _drawn(target, inner)["splat"]
-    grid = pixel_grid(scene.image_size, dtype=depth.dtype)
-    assert_near(weight.sum(), scene.weights.sum(), VALUE_TOLERANCE, "(weight)")
-    found, wanted = (weight * depth).sum(), (scene.weights * scene.depth).sum()
-    assert_near(found, wanted, 1e-8, "m (summed)")
-    center, true = weight.flatten() @ grid, scene.weights @ inner.pixels
-    assert_near(center, true, 1e-8, "px (summed)")
+    """A pixel has the bilinear shares of its points' weights, and the mean depth under these."""
+    depth, weight = _drawn(target, scene)["splat"]
+    away = pixel_grid(scene.image_size, dtype=depth.dtype)[:, None] - scene.pixels
+    shares = (1 - away.abs()).clamp(min=0).prod(dim=-1) * scene.weights
+    total, moment = shares.sum(dim=-1), shares @ scene.depth
+    assert_near(weight.flatten(), total, VALUE_TOLERANCE, "(weight)")
+    assert_near((weight * depth).flatten(), moment, 1e-8, "m (times weight)")
 
 
 @invariant("drawing", scenes="depths")
@@ -68,15 +66,16 @@ def a_point_at_a_pixels_centre_goes_there(target: Target, scene: DepthScene) -> 
 
 @invariant("drawing", scenes="depths")
 def points_outside_leave_no_trace(target: Target, scene: DepthScene) -> None:
-    """Points more than a pixel outside the image draw nothing."""
+    """Points more than a pixel outside the image, or at NaN, draw nothing."""
     height, width = scene.image_size
     # Along one axis at a time: an index y W + x of a point to the right is one of the next row.
     away = 2 * torch.tensor([[width + 1, 0], [0, height + 1]]).to(scene.pixels)
     outside = [scene.pixels + sign * shift for shift in away for sign in (-1, 1)]
+    outside.append(scene.pixels * torch.nan)
     more = DepthScene(
         torch.cat([scene.pixels, *outside]),
-        torch.cat([scene.depth, (scene.depth / 2).repeat(4)]),
-        scene.weights.repeat(5),
+        torch.cat([scene.depth, (scene.depth / 2).repeat(5)]),
+        scene.weights.repeat(6),
         scene.image_size,
     )
     _assert_same(_drawn(target, more), _drawn(target, scene))

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from deltas_geom.cameras.pixels import pixel_grid
+from deltas_geom.cameras.pixels import pixel_grid, read_map
 from deltas_geom.testing.agreement import (
     EXTREMES,
     VALUE_TOLERANCE,
@@ -89,13 +89,15 @@ def what_is_read_is_finite(
     assert_finite(_read(target, scene, pixels), "value")
 
 
-@invariant("correlate", "sample_map", scenes="maps")
+@invariant("correlate", scenes="maps")
 def correlating_is_reading_and_multiplying(target: Target, scene: MapScene) -> None:
     """Scores are the dot products of descriptors with the features read at each place."""
     assert target.correlate is not None
-    places = torch.stack([scene.pixels, scene.pixels.flip(0), scene.pixels / 2], dim=1)
+    pixels = _inner(scene)
+    places = torch.stack([pixels, pixels.flip(0)], dim=1)
     found = target.correlate(scene.descriptors, scene.feature_map, places, scene.image_size)
-    read = _read(target, scene, places.flatten(0, 1)).reshape(*places.shape[:2], -1)
+    read = read_map(scene.feature_map, places.flatten(0, 1), image_size=scene.image_size)
+    read = read.mT.reshape(*places.shape[:2], -1)
     wanted = (scene.descriptors[:, None] * read).sum(dim=-1)
     assert_near(found, wanted, VALUE_TOLERANCE, "(score)")
 

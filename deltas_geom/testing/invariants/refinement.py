@@ -23,8 +23,8 @@ def refined_points_fit_no_worse(
     """The weighted residual in px is never larger after refining than before."""
     weights = weights_for(target, scene, weights)
     start = scene.points if start is None else start
-    before = _residual(scene, start, weights)
-    after = _residual(scene, _refined(target, scene, start, weights), weights)
+    before = residual_of(scene, start, weights)
+    after = residual_of(scene, _refined(target, scene, start, weights), weights)
     worse = after > before + 1e-8 * slack()  # px
     if bool(worse.any()):
         point = int(worse.nonzero()[0])
@@ -49,7 +49,7 @@ def _refined(target: Target, scene: PosedScene, start: Tensor, weights: Tensor |
     return target.refine(scene.views.proj, scene.pixels, start, weights)
 
 
-def _residual(scene: PosedScene, points: Tensor, weights: Tensor | None) -> Tensor:
+def residual_of(scene: PosedScene, points: Tensor, weights: Tensor | None) -> Tensor:
     """``(N)`` weighted RMS distance of the projections from the pixels, px."""
     seen = to_homogeneous(points) @ scene.views.proj.mT
     distance = (seen[..., :2] / seen[..., 2:] - scene.pixels).square().sum(dim=-1)

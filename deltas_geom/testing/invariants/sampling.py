@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from deltas_geom.cameras.pixels import in_image
 from deltas_geom.testing.agreement import (
     PIXEL_TOLERANCE,
     assert_finite,
@@ -40,9 +41,10 @@ def samples_run_from_the_far_to_the_near_end(
 ) -> None:
     """Inverse depth grows from sample to sample, and all visible depths lie between the outer two.
 
-    The outer samples are within the depth range.
+    All samples are in the image, and the outer ones within the depth range.
     """
     near, far = depth_range
+    border = -slack() * PIXEL_TOLERANCE
     for pixels, inv_depth, visible in _spaced(target, scene, depth_range, count):
         rounding = 1e-10 * slack()
         shrinks = (inv_depth.diff(dim=-1) <= 0).any(dim=-1) & visible
@@ -54,6 +56,10 @@ def samples_run_from_the_far_to_the_near_end(
             item = int((beyond & visible).nonzero()[0])
             first, last = inv_depth[item, [0, -1]].tolist()
             raise AssertionError(f"item {item} is sampled from {first} to {last} 1/m")
+        outside = visible[:, None] & ~in_image(pixels, image_size=IMAGE_SIZE, border=border)
+        if bool(outside.any()):
+            item, sample = outside.nonzero()[0].tolist()
+            raise AssertionError(f"item {item} is sampled at {pixels[item, sample].tolist()} px")
         ends = (pixels[:, 0], pixels[:, -1], visible)
         assert_covers(scene.views, scene.pixels[0], ends, depth_range, IMAGE_SIZE)
 

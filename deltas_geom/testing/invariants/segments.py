@@ -104,10 +104,12 @@ def a_segment_out_of_sight_is_flagged(
     away = scene.views.select([0, 1])._replace(cam_from_world=torch.stack([anchor, turn @ anchor]))
     found = _segments(target, scene._replace(views=away), depth_range, IMAGE_SIZE)[2]
     assert_status(found, empty, VISIBLE)
-    spoiled = scene.pixels.clone()
-    spoiled[0, :, 0] = torch.nan
+    spoiled = torch.cat([torch.full_like(scene.pixels, torch.nan), scene.pixels], dim=1)
     found = _segments(target, scene._replace(pixels=spoiled), depth_range, IMAGE_SIZE)[2]
-    assert_status(found, torch.full_like(empty, Status.NOT_FINITE_INPUT), VISIBLE)
+    alone = _segments(target, scene, depth_range, IMAGE_SIZE)[2]
+    lost = torch.full_like(empty, Status.NOT_FINITE_INPUT)
+    assert_status(found[: len(lost)], lost, VISIBLE)
+    assert bool((found[len(lost) :] == alone).all()), "a keypoint of NaN changes another's status"
 
 
 @invariant("segments")

@@ -168,15 +168,18 @@ def a_batch_of_scenes_is_solved_as_each_alone(target: Target, scene: PosedScene)
     assert target.triangulate is not None
     weights = weights_for(target, scene, None)
     pixels = torch.stack([scene.pixels, scene.pixels + 0.5])
+    moved = scene._replace(views=ELSEWHERE.views(scene.views))
+    proj = torch.stack([scene.views.proj, moved.views.proj])
     many = None if weights is None else torch.stack([weights, 2 * weights.flip(0), weights**2])
-    found = target.triangulate(scene.views.proj, pixels[:, None], many)
+    found = target.triangulate(proj[:, None, None], pixels[:, None], many)
     count = 1 if many is None else 3
     alone = [
-        points_of(target, scene._replace(pixels=pixels[i]), None if many is None else many[j])
+        points_of(target, each._replace(pixels=pixels[i]), None if many is None else many[j])
+        for each in (scene, moved)
         for i in range(2)
         for j in range(count)
     ]
-    wanted = torch.stack(alone).reshape(2, count, *alone[0].shape)
+    wanted = torch.stack(alone).reshape(2, 2, count, *alone[0].shape)
     assert_near(found, wanted, POINT_TOLERANCE, "m")
 
 
