@@ -1,6 +1,7 @@
 """`deltas recipe`: parts one after the other, each from the weights of the one before."""
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -193,6 +194,18 @@ def test_nonsense_is_refused_before_anything_is_written(
     out = tmp_path / "run"
     assert_one_line(run("recipe", "night", "--out", out, "--workers", 0, *arguments), said)
     assert not out.exists() or not any(out.iterdir())
+
+
+@pytest.mark.parametrize(
+    "command", [("train", "--encoder", "none"), ("recipe", "night", "--init", "deltas-small")]
+)
+def test_without_the_extra_of_training_nothing_is_written(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.setitem(sys.modules, "lightning_fabric", None)
+    said = run(*command, "--out", tmp_path / "run")
+    assert_one_line(said, "lightning_fabric", 'pip install "deltas-depth[train]"')
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_of_another_kind_are_refused_before_the_folder_remembers_them(
