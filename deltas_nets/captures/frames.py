@@ -113,6 +113,12 @@ class Frames(Mapping[str, Frame]):
         )
         return cls(folder, arrays)
 
+    def __repr__(self) -> str:
+        ids = [repr(self.id_at(position)) for position in range(min(3, len(self)))]
+        ids += ["..."] if len(self) > 4 else []
+        ids += [repr(self.id_at(len(self) - 1))] if len(self) > 3 else []
+        return f"Frames({len(self)}{': ' if ids else ''}{', '.join(ids)})"
+
     def __len__(self) -> int:
         return len(self.arrays.ids)
 
