@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, table_console
+from deltas_nets.terminal import counted, progress, table_console
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Calibrate(Command):
         said = f"procedural rooms {first}..{first + self.rooms}, {counts} views, {size}"
         # Before the reader of what is printed may have had enough.
         save_weights(self.out, model, metadata | {"calibration": said})
-        found, console = f"{len(shown)} other rooms", table_console()
+        found, console = counted(len(shown), "other room"), table_console()
         console.print(calibration_table(before.result(), title=f"{found}, before"))
         console.print(calibration_table(after.result(), title=f"{found}, after"))
         print(sparsification_line(after.result()))

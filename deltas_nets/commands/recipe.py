@@ -117,6 +117,7 @@ class Recipe(Command):
             redrawn = add_redraw(recipe, calibrated, self.out, workers=workers, report=report)
         sign(redrawn, recipe, beginning)
         redrawn.replace(finished)
+        print(f"finished weights in {finished}")
 
     def _workers(self) -> int:
         if self.workers is None:

@@ -119,6 +119,7 @@ def test_the_command_trains_and_calibrates(tmp_path: Path, run: Run) -> None:
     result = run("recipe", "night", "--out", out, "--workers", 0)
     assert result.code == 0, result.err
     assert "part 1 of 2: 1-first, 1 steps" in result.out
+    assert result.out.splitlines()[-1] == f"finished weights in {out / 'weights.safetensors'}"
     record = read_metadata(out / "weights.safetensors")
     assert record["step"] == "2" and record["seed"] == "1"
     assert "EfficientNet-Lite0" in record["origin"] and "rooms" in record["calibration"]
