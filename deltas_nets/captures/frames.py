@@ -129,6 +129,8 @@ class Frames(Mapping[str, Frame]):
         return id in self._positions
 
     def __getitem__(self, id: str) -> Frame:
+        if id not in self._positions:
+            raise KeyError(f"no frame has the id {id!r}; Capture.frame takes numbers, too")
         return self.at(self._positions[id])
 
     @property

@@ -32,7 +32,11 @@ def test_frames_print_their_ids(count: int, shown: str) -> None:
     def frame(id: int) -> Frame:
         return Frame(str(id), Path(f"{id}.jpg"), (4, 6), np.eye(3), np.eye(4))
 
-    assert repr(Frames.of(map(frame, range(count)))) == shown
+    frames = Frames.of(map(frame, range(count)))
+    assert repr(frames) == shown and frames.get("nine") is None
+    number: Any = 0
+    with pytest.raises(KeyError, match=r"no frame has the id 0; Capture\.frame takes numbers"):
+        frames[number]
 
 
 @pytest.mark.parametrize(
