@@ -35,7 +35,7 @@ class Calibrate(Command):
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (288, 384)
     """Of their images: the one that the weights will work at, for standard deviations change with
     it."""
-    depth_range: tuple[float, float] = (0.5, 10.0)
+    depth_range: Annotated[tuple[float, float], tyro.conf.arg(metavar="NEAR FAR")] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda, cuda:1, mps."""
