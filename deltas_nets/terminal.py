@@ -76,7 +76,8 @@ def progress(name: str, total: int) -> Iterator[Callable[[str], None]]:
     seconds. An error is alone on its stream.
     """
     if not sys.stdout.isatty():
-        yield _lines(name, total)
+        lines = Lines(name, total)
+        yield lambda _: lines.advance()
         return
     from rich.progress import Progress, TextColumn
 
@@ -94,18 +95,19 @@ def table_console() -> "Console":
     return Console(markup=False, emoji=False)
 
 
-def _lines(name: str, total: int) -> Callable[[str], None]:
-    """Tell of progress in lines: "depth: 12 of 186"."""
-    done, told = 0, time.monotonic()
+class Lines:
+    """Progress in lines, at least ten seconds apart: "depth: 12 of 186"."""
 
-    def report(_: str) -> None:
-        nonlocal done, told
-        done += 1
-        if time.monotonic() - told >= SECONDS_BETWEEN_LINES:
-            print(f"{name}: {done} of {total}", flush=True)
-            told = time.monotonic()
+    def __init__(self, name: str, total: int, *, done: int = 0) -> None:
+        self.name, self.total, self.done = name, total, done
+        self._told = time.monotonic()
 
-    return report
+    def advance(self, more: str = "") -> None:
+        """One is done, of which there is more to tell."""
+        self.done += 1
+        if time.monotonic() - self._told >= SECONDS_BETWEEN_LINES:
+            print(f"{self.name}: {self.done} of {self.total}{more}", flush=True)
+            self._told = time.monotonic()
 
 
 @contextlib.contextmanager

@@ -17,9 +17,9 @@ ABOVE = {
         "diagnosis modules testing"
     ),
     "deltas_nets": (
-        "errors terminal config captures network check outputs weights_file losses reference rooms "
-        "datasets cost agree fuse predict baselines distill evaluate ablations page view teachers "
-        "export train commands cli __main__"
+        "errors extras terminal config captures network check outputs weights_file losses "
+        "reference rooms datasets cost agree fuse predict baselines distill evaluate ablations "
+        "page view teachers export train commands cli __main__"
     ),
 }
 ORDER = {package: names.split() for package, names in ABOVE.items()}

@@ -94,9 +94,13 @@ def measure(
         report: called with the name of every finished step.
 
     Raises:
-        UserError: no such weights, or no step could be measured.
+        UserError: no such weights, a method of the series is not installed, or no step could be
+            measured.
     """
     loaded = {name: load_predictor(name, device) for name in networks}
+    for step in series.steps:
+        if step.weights is not None:
+            load_predictor(step.weights, device)  # what is not installed is told before all work
     shown = _shown(loaded)
     records = {
         name: found.weights_record(name) | {"name": shown[name]} for name, found in loaded.items()

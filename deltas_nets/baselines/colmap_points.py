@@ -12,7 +12,7 @@ from PIL import Image
 from deltas_geom import PosedViews, project
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.work_size import anchor_views
-from deltas_nets.errors import UserError
+from deltas_nets.extras import check_extra
 from deltas_nets.predict.depth_map import KeypointDepths
 
 __all__ = ["colmap", "sparse_points"]
@@ -24,14 +24,10 @@ def colmap() -> Any:
     Raises:
         UserError: it is not installed.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise UserError(
-            "COLMAP's baselines need pycolmap",
-            "--weights",
-            'pip install "deltas-depth[colmap]"',
-        ) from None
+    named = "colmap-sparse and colmap-densified"
+    check_extra("colmap", "pycolmap", wanted_by="COLMAP's baselines need", where=named)
+    import pycolmap
+
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

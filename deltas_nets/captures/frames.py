@@ -113,6 +113,12 @@ class Frames(Mapping[str, Frame]):
         )
         return cls(folder, arrays)
 
+    def __repr__(self) -> str:
+        ids = [repr(self.id_at(position)) for position in range(min(3, len(self)))]
+        ids += ["..."] if len(self) > 4 else []
+        ids += [repr(self.id_at(len(self) - 1))] if len(self) > 3 else []
+        return f"Frames({len(self)}{': ' if ids else ''}{', '.join(ids)})"
+
     def __len__(self) -> int:
         return len(self.arrays.ids)
 
@@ -123,6 +129,8 @@ class Frames(Mapping[str, Frame]):
         return id in self._positions
 
     def __getitem__(self, id: str) -> Frame:
+        if id not in self._positions:
+            raise KeyError(f"no frame has the id {id!r}; Capture.frame takes numbers, too")
         return self.at(self._positions[id])
 
     @property

@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, usable_device
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, table_console
+from deltas_nets.terminal import counted, progress, table_console
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Calibrate(Command):
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (288, 384)
     """Of their images: the one that the weights will work at, for standard deviations change with
     it."""
-    depth_range: tuple[float, float] = (0.5, 10.0)
+    depth_range: Annotated[tuple[float, float], tyro.conf.arg(metavar="NEAR FAR")] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda, cuda:1, mps."""
@@ -91,7 +91,7 @@ class Calibrate(Command):
         said = f"procedural rooms {first}..{first + self.rooms}, {counts} views, {size}"
         # Before the reader of what is printed may have had enough.
         save_weights(self.out, model, metadata | {"calibration": said})
-        found, console = f"{len(shown)} other rooms", table_console()
+        found, console = counted(len(shown), "other room"), table_console()
         console.print(calibration_table(before.result(), title=f"{found}, before"))
         console.print(calibration_table(after.result(), title=f"{found}, after"))
         print(sparsification_line(after.result()))

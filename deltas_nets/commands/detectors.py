@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.commands.values import at_least_one, not_empty, not_negative, positive
-from deltas_nets.terminal import progress, table_console, warn
+from deltas_nets.terminal import counted, progress, table_console, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.detectors.config import TableConfig
@@ -118,7 +118,9 @@ class Detectors(Command):
             data = {"name": capture.path.name, "view_sets": len(view_sets), "pairs": len(pairs)}
             rows = detector_rows(scores)
             write_record(self.json, record_of("detectors", rows, extractors, config, data))
-        title = f"{self.capture}: {len(pairs)} pairs of {len(view_sets)} anchors"
+        title = (
+            f"{self.capture}: {counted(len(pairs), 'pair')} of {counted(len(view_sets), 'anchor')}"
+        )
         table_console().print(detector_table(scores, title=title))
 
     def _of_pairs(self) -> None:
@@ -136,5 +138,5 @@ class Detectors(Command):
             data = {"name": f"{self.capture.parent.name}/{self.capture.name}", "pairs": len(pairs)}
             rows = relative_rows(scores)
             write_record(self.json, record_of("relative poses", rows, extractors, config, data))
-        title = f"{self.capture}: {len(pairs)} pairs"
+        title = f"{self.capture}: {counted(len(pairs), 'pair')}"
         table_console().print(relative_table(scores, title=title))

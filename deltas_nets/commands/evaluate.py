@@ -16,7 +16,7 @@ from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
-from deltas_nets.terminal import progress, table_console, warn
+from deltas_nets.terminal import counted, progress, table_console, warn
 
 if TYPE_CHECKING:
     from deltas_nets.evaluate.dataset import DatasetScores
@@ -148,7 +148,9 @@ class Evaluate(Prediction):
 
         scorer = self._scorer(many=many)
         scores = evaluate_scenes(scenes, protocol, scorer, depth_range=self.range)
-        title = f"{len(scenes)} scenes" if many else str((*self.captures, *scenes.values())[0])
+        title = (
+            counted(len(scenes), "scene") if many else str((*self.captures, *scenes.values())[0])
+        )
         return scores, title
 
     def _protocol(self, name: str, path: Path, *, many: bool) -> "ViewProtocol":
@@ -239,7 +241,7 @@ class Evaluate(Prediction):
         console, total = table_console(), scores.total
         if len(scores.scenes) + len(scores.failed) > 1:
             console.print(report.scenes_table(scores, title="scenes, means over frames"))
-        title = f"{title}: {len(total.frames)} frames"
+        title = f"{title}: {counted(len(total.frames), 'frame')}"
         columns = report.scores_by_name(total)
         console.print(report.metrics_table(columns, title=title, metric=total.metric))
         if total.sparse is not None and math.isnan(total.sparse.abs_rel):

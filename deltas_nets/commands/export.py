@@ -35,7 +35,7 @@ class Export(Command):
     """Points to triangulate."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="HEIGHT WIDTH")] = (240, 320)
     """Of the images."""
-    depth_range: tuple[float, float] = (0.5, 10.0)
+    depth_range: Annotated[tuple[float, float], tyro.conf.arg(metavar="NEAR FAR")] = (0.5, 10.0)
     """Nearest and farthest depth searched, metres."""
     refinement: int = 8
     """Samples in each bin of inverse depth. The network takes 8 at most; fewer are faster, and

@@ -60,6 +60,7 @@ class Recipe(Command):
 
         from deltas_nets.distill.teachers import load_teacher
         from deltas_nets.outputs.atomic_files import check_writable
+        from deltas_nets.train.processes import check_training
         from deltas_nets.train.recipe import Beginning, add_redraw, begin, run_parts, sign
         from deltas_nets.weights_file import load_model, weights_file
 
@@ -72,6 +73,7 @@ class Recipe(Command):
         if self.name == "hour" and not torch.cuda.is_available():
             what = "hour learns from 64 rooms at once, on a GPU, and there is none"
             raise UserError(what, "command line", "use night")
+        check_training()
         workers = self._workers()
         init = None if self.init is None else weights_file(self.init)
         encoder = None
@@ -115,6 +117,7 @@ class Recipe(Command):
             redrawn = add_redraw(recipe, calibrated, self.out, workers=workers, report=report)
         sign(redrawn, recipe, beginning)
         redrawn.replace(finished)
+        print(f"finished weights in {finished}")
 
     def _workers(self) -> int:
         if self.workers is None:

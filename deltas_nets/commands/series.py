@@ -9,7 +9,7 @@ import tyro
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.flags import Flag, sensible, usable_device
 from deltas_nets.commands.values import at_least_one, not_empty, not_negative
-from deltas_nets.terminal import progress, table_console
+from deltas_nets.terminal import counted, progress, table_console
 
 if TYPE_CHECKING:
     from deltas_nets.ablations.steps import Series
@@ -103,7 +103,7 @@ class MeasuredSeries(Command):
         )
         write_record(self.out / f"{series.name}.json", record)
         draw_series(self.out / f"{series.name}.png", series, record.rows)
-        print(f"{series.title}: {path}, {len(view_sets)} view sets")
+        print(f"{series.title}: {path}, {counted(len(view_sets), 'view set')}")
         for table in series_tables(series, record.rows):
             table_console().print(table)
         for row in record.rows:

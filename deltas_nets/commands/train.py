@@ -94,10 +94,12 @@ class Train(Command):
         """Run the command."""
         from deltas_nets.outputs.atomic_files import check_writable
         from deltas_nets.train.fit import fit
+        from deltas_nets.train.processes import check_training
         from deltas_nets.train.resume import check_continues
         from deltas_nets.train.start import Start
         from deltas_nets.weights_file import weights_file
 
+        check_training()
         self._check_counts()
         if self.start_step and self.init is None:
             raise UserError("start from what?", "--start-step", "add --init FILE")

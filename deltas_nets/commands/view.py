@@ -46,9 +46,9 @@ class View(Command):
     def run(self) -> None:
         """Run the command."""
         from deltas_nets.page.maps import open_maps
-        from deltas_nets.view.viewer import check_address, check_extra, open_viewer
+        from deltas_nets.view.viewer import check_address, check_viewer, open_viewer
 
-        check_extra()
+        check_viewer()
         if not 0 < self.port < 65536:
             raise UserError("no port", f"--port {self.port}", "give 1 to 65535")
         check_address(self.host)

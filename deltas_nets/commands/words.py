@@ -91,6 +91,10 @@ def _no_row(match: re.Match[str], _: Any) -> str:
     return f"{match['option']} takes {kinds}, got {got or 'nothing'}"
 
 
+def _too_few(match: re.Match[str], _: Any) -> str:
+    return f"{match['option']} takes {match['count']}, got fewer"
+
+
 def _no_choice(match: re.Match[str], _: Any) -> str:
     *known, last = re.findall(r"'([^']*)'", match["known"])
     return f"{match['option']} takes {', '.join(known)} or {last}, got {match['got']}"
@@ -133,6 +137,10 @@ _SAYINGS: tuple[tuple[str, Callable[[re.Match[str], Any], str]], ...] = (
         r"Error parsing (?P<option>--[\w.-]+): (?:no type matching )?(?P<kinds>[A-Z][A-Z |]*?)"
         r" expected, got (?P<got>\[.*?\])",
         _expected,
+    ),
+    (
+        r"Missing value for argument '(?P<option>--[\w.-]+)'\. Expected (?P<count>\d+ values)",
+        _too_few,
     ),
     (
         r"Error parsing (?P<option>--[\w.-]+): invalid literal for (?P<kind>int)\(\) with base 10: "

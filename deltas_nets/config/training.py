@@ -122,7 +122,10 @@ class TrainConfig:
     teacher: Literal["superpoint", "aliked", "disk", "xfeat", "deltas"] | None = None
     """Whose interest points the detector learns to find (the paper: SuperPoint's), with weights
     from --teacher-weights; Shi-Tomasi corners without one."""
-    pose_noise: tuple[float, float] = (0.004, 0.0015)
+    pose_noise: Annotated[tuple[float, float], tyro.conf.arg(metavar="METRES RADIANS")] = (
+        0.004,
+        0.0015,
+    )
     """Standard deviation of the sources' pose errors, metres and radians, for a common tracker:
     each room's has a quarter to twice as much."""
     clip_gradient: float = 5.0

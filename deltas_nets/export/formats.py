@@ -6,7 +6,6 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from deltas_nets.export.graph import (
     trace,
     without_paths,
 )
+from deltas_nets.extras import check_extra
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.outputs.atomic_files import plain, write_atomically
 
@@ -71,7 +71,7 @@ def export_onnx(
         ['images', 'K', 'cam_from_world']
     """
     out, config = Path(out), config or ExportConfig()
-    check_extra(out)
+    check_onnx(out)
     content = onnx_bytes(trace(model, config), metadata_of(model, config, weights), out)
     agreement = check_agreement(onnx_runner(content), model, config, runtime="onnxruntime", out=out)
     write_atomically(out, lambda file: file.write(content))
@@ -111,19 +111,15 @@ def export_program(
     return agreement
 
 
-def check_extra(out: Path) -> None:
+def check_onnx(out: Path) -> None:
     """Are the packages installed that ONNX needs?
 
     Raises:
         UserError: one is missing.
     """
-    for package in ("onnx", "onnxscript", "onnxruntime"):
-        if find_spec(package) is None:
-            raise UserError(
-                f"ONNX needs the package {package}",
-                out,
-                'pip install "deltas-depth[export]", or export a .pt2 file',
-            )
+    packages = ("onnx", "onnxscript", "onnxruntime")
+    otherwise = "export a .pt2 file"
+    check_extra("export", *packages, wanted_by="ONNX needs", where=out, otherwise=otherwise)
 
 
 def metadata_of(

@@ -1,6 +1,5 @@
 """Files of clouds and meshes."""
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.ply_vertices import header_of, vertices_of
 from deltas_nets.captures.upright import y_up_from_world
-from deltas_nets.errors import UserError
+from deltas_nets.extras import check_extra
 from deltas_nets.fuse.cloud import CloudPoints
 from deltas_nets.fuse.mesh import Mesh
 from deltas_nets.outputs.atomic_files import write_atomically
@@ -53,9 +52,8 @@ def check_mesh_extra(path: Path) -> None:
     Raises:
         UserError: it is not.
     """
-    if find_spec("trimesh") is None:
-        remedy = 'pip install "deltas-depth[mesh]", or ask for mesh.ply with --mesh'
-        raise UserError("GLB needs the package trimesh", path, remedy)
+    otherwise = "ask for mesh.ply with --mesh"
+    check_extra("mesh", "trimesh", wanted_by="GLB needs", where=path, otherwise=otherwise)
 
 
 def write_glb(path: Path, mesh: Mesh, up: FloatArray) -> None:

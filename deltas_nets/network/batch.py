@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom import PosedViews
-from deltas_geom.checks import ShapeError, check_depth_range, check_shapes
+from deltas_geom.checks import ShapeError, check_depth_range, check_kind, check_shapes
 from deltas_nets.network.prediction import DepthPrediction
 
 
@@ -40,6 +40,7 @@ def flat_batch(images: Tensor, views: PosedViews, depth_range: tuple[float, floa
     Raises:
         ShapeError: a trailing shape differs, there is no source, or the batch is empty.
         ValueError: the depth range makes no sense.
+        TypeError: not a tensor, or not posed views.
 
     Example:
         >>> views = PosedViews(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4))
@@ -47,6 +48,8 @@ def flat_batch(images: Tensor, views: PosedViews, depth_range: tuple[float, floa
         >>> flat.images.shape, flat.views.K.shape, flat.dims
         (torch.Size([20, 2, 3, 48, 64]), torch.Size([20, 2, 3, 3]), torch.Size([4, 5]))
     """
+    check_kind("views", views, PosedViews, "PosedViews(K, cam_from_world)")
+    views.check_shapes()
     check_shapes(images=(images, "V 3 H W"), K=(views.K, "V 3 3"))
     check_depth_range(depth_range)
     if images.shape[-4] < 2:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_geom import PosedViews, SparseDepth, rasterize_depth, triangulate
+from deltas_geom.checks import check_kind
 from deltas_geom.numerics.arithmetic import outside_autocast
 from deltas_nets.config import NetworkConfig
 from deltas_nets.network.batch import flat_batch, with_batch_dims
@@ -39,7 +40,10 @@ class Deltas(nn.Module):
     """Posed images in, metric depth of the first one out.
 
     Args:
-        config: sizes and choices; the default is `deltas-small`.
+        config: sizes and choices; `NetworkConfig()` has those of `deltas-small`.
+
+    Raises:
+        TypeError: not a config.
 
     Example:
         >>> model = Deltas(NetworkConfig()).eval()
@@ -54,6 +58,7 @@ class Deltas(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
+        check_kind("config", config, NetworkConfig, "load_model(NAME) for weights of a name")
         self.config = config
         stages = build_stages(config)
         self.encoder = stages.encoder

@@ -42,7 +42,13 @@ class KnownDepth(Record):
     deviation: Tensor
 
     def confidence(self, tolerance: float = 0.05) -> Tensor:
-        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``."""
+        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``.
+
+        Raises:
+            ValueError: the tolerance is not positive.
+        """
+        if not tolerance > 0:
+            raise ValueError(f"tolerance must be a positive share of the depth, got {tolerance}")
         relative_scale = self.deviation / 2**0.5  # of a Laplace distribution
         return 1 - torch.exp(-tolerance / relative_scale.clamp_min(1e-6))
 

@@ -47,5 +47,9 @@ class DepthPrediction(Record):
     evidence: Evidence
 
     def confidence(self, tolerance: float = 0.05) -> Tensor:
-        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``."""
+        """Probability ``(*B, 1, H, W)`` that the relative error is below ``tolerance``.
+
+        Raises:
+            ValueError: the tolerance is not positive.
+        """
         return KnownDepth(self.depth, self.std / self.depth).confidence(tolerance)

@@ -43,7 +43,12 @@ class PredictConfig:
                 f"--depth-range must be NEAR FAR with 0 < NEAR < FAR, got {near} {far}"
             )
         for name, size in (("--work-size", self.work_size), ("--size", self.size)):
-            if size is not None and min(size) < 32:
+            if size is None:
+                continue
+            whole = isinstance(size, tuple | list) and len(size) == 2
+            if not whole or not all(
+                isinstance(side, int | np.integer) and side >= 32 for side in size
+            ):
                 raise ValueError(f"{name} must be HEIGHT WIDTH of 32 or more, got {size}")
         if not 0 <= self.min_confidence <= 1:
             raise ValueError(f"--min-confidence must be within 0 to 1, got {self.min_confidence}")

@@ -42,6 +42,7 @@ def look(
 
     Raises:
         UserError: an image cannot be read.
+        TypeError: the network gives something else than a map of the size that was asked for.
     """
     unit = reach.unit
     config = replace(config, depth_range=(reach.near * unit, reach.far * unit))
@@ -50,12 +51,24 @@ def look(
     if measured is not None:
         measured = measured._replace(depth=measured.depth * unit)
     of_straight = replace(config, size=None) if isinstance(anchor, StraightFrame) else config
-    found = predictor.depth_map(Wanted(seen, of_straight, measured))
+    wanted = Wanted(seen, of_straight, measured)
+    found = predictor.depth_map(wanted)
+    _check_map(found, wanted.size, who=type(predictor).__name__)
     if measured is not None and others:
         factor = measured_factor(found.keypoints, measured, anchor.image_size)
         found = found._replace(measured_factor=factor)
     found = found if unit == 1 else _in_units_of_capture(found, unit)
     return as_photographed(found, anchor, config)
+
+
+def _check_map(found: object, size: tuple[int, int], *, who: str) -> None:
+    """Networks may be anybody's: what is no map is told where it comes from."""
+    if not isinstance(found, DepthMap):
+        raise TypeError(f"{who}.depth_map must return a DepthMap, got {type(found).__name__}")
+    depth: object = found.depth
+    if not isinstance(depth, np.ndarray) or depth.shape != tuple(size):
+        got = f"{type(depth).__name__} {tuple(getattr(depth, 'shape', ()))}"
+        raise TypeError(f"{who}.depth_map must give depth as an ndarray {tuple(size)}, got {got}")
 
 
 def as_photographed(found: DepthMap, anchor: Frame, config: PredictConfig) -> DepthMap:

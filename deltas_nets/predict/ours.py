@@ -76,6 +76,9 @@ class DeltasPredictor:
         self.describe = DescribedFrames(self.encode)
         self.without_points = without_points
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.encode.model.config.name})"
+
     def varied(self, settings: NetworkSettings) -> "DeltasPredictor":
         """The same weights in a network of another config."""
         model = self.encode.model

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import torch
 
@@ -136,11 +136,14 @@ def load_predictor(
     Raises:
         UserError: no such file, or it holds none of these, or not all of its weights, or the
             network does not run in this precision.
+        ValueError: no such precision.
 
     Example:
         >>> load_predictor("deltas-small").network_record()["name"]
         'deltas-small'
     """
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision must be one of {get_args(Precision)}, got {precision!r}")
     if name_or_file in BASELINES:
         _check_float32(precision, str(name_or_file))
         baseline: Predictor = look_up("deltas_nets.baselines", BASELINES[str(name_or_file)])(device)

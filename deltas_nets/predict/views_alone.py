@@ -36,6 +36,9 @@ class ViewsAlone:
         if wanted.measured is not None or len(wanted.frames) == 1:
             self.check_measured()
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.called})"
+
     def refuse_confidence(self, config: PredictConfig) -> None:
         """Refuse what only a network that states a confidence can use.
 

@@ -1,6 +1,7 @@
 """What a run tells: a progress bar, a line of JSON every few steps, and TensorBoard's curves."""
 
 import json
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from deltas_nets.config import TrainConfig, to_dict
 from deltas_nets.outputs.atomic_files import cannot_write, plain, write_atomically
+from deltas_nets.terminal import Lines, table_console
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -72,8 +74,11 @@ class FolderLog(RunLog):
             MofNCompleteColumn(),
             TextColumn("{task.fields[loss]}"),
             TimeRemainingColumn(),
+            console=table_console(),
+            disable=not sys.stdout.isatty(),
         )
         self._task = self._bar.add_task("training", total=config.steps, completed=step, loss="")
+        self._lines, self._loss = Lines("training", config.steps, done=step), ""
 
     def __enter__(self) -> "FolderLog":
         self._bar.start()
@@ -87,8 +92,10 @@ class FolderLog(RunLog):
                 self._curves.close()
 
     def progress(self, step: int) -> None:
-        """Move the bar."""
-        self._bar.update(self._task, completed=step)
+        """Move the bar; in a pipe or a file, which has none, tell in a line now and then."""
+        self._bar.update(self._task, completed=step, loss=self._loss)
+        if self._bar.disable:
+            self._lines.advance(f", {self._loss}" if self._loss else "")
 
     def losses(
         self, step: int, losses: Mapping[str, float], *, rate: float, seconds: float
@@ -97,7 +104,7 @@ class FolderLog(RunLog):
         self._write({"step": step, **losses, "rate": rate, "seconds": seconds})
         self._draw("loss", losses, step)
         self._draw("training", {"rate": rate, "seconds": seconds}, step)
-        self._bar.update(self._task, loss=f"loss {losses['total']:.3f}")
+        self._loss = f"loss {losses['total']:.3f}"
 
     def validation(self, step: int, metrics: Mapping[str, float]) -> None:
         """A line, a point on every curve, and a message."""

@@ -6,10 +6,20 @@ from typing import TYPE_CHECKING
 
 from deltas_nets.config import TrainConfig
 from deltas_nets.errors import UserError
+from deltas_nets.extras import check_extra
 from deltas_nets.train.loader import Part
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
+
+
+def check_training() -> None:
+    """Is the package installed that training needs?
+
+    Raises:
+        UserError: it is not.
+    """
+    check_extra("train", "lightning_fabric", wanted_by="training needs", where="deltas train")
 
 
 def launch_fabric(config: TrainConfig) -> "Fabric":
@@ -21,12 +31,9 @@ def launch_fabric(config: TrainConfig) -> "Fabric":
     Raises:
         UserError: lightning-fabric is not installed, or the number of processes does not fit.
     """
-    try:
-        from lightning_fabric import Fabric
-    except ImportError:
-        raise UserError(
-            "training needs lightning-fabric", "deltas-depth", 'pip install "deltas-depth[train]"'
-        ) from None
+    check_training()
+    from lightning_fabric import Fabric
+
     # DDP says so of depthwise weights in channels-last order, which lie in memory as it wants.
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
     launched = "LT_CLI_USED" in os.environ

@@ -4,7 +4,6 @@ import io
 import math
 import socket
 from contextlib import redirect_stdout
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.spread import spread
 from deltas_nets.captures.upright import up_of
 from deltas_nets.errors import UserError
+from deltas_nets.extras import check_extra
 from deltas_nets.page.maps import Maps
 from deltas_nets.page.pictures import size_within
 from deltas_nets.page.scene import (
@@ -31,7 +31,7 @@ from deltas_nets.page.scene import (
 if TYPE_CHECKING:
     from viser import ViserServer
 
-__all__ = ["check_address", "check_extra", "open_viewer"]
+__all__ = ["check_address", "check_viewer", "open_viewer"]
 
 MOST_POINTS, MOST_FACES = 400_000, 400_000
 MOST_IMAGES, IMAGE_LONGEST = 200, 160
@@ -40,15 +40,13 @@ SMALLEST = 1e-6
 CAMERA_BLUE = (86, 138, 242)
 
 
-def check_extra() -> None:
+def check_viewer() -> None:
     """Is the package installed that the viewer needs?
 
     Raises:
         UserError: it is not.
     """
-    if find_spec("viser") is None:
-        remedy = 'pip install "deltas-depth[view]"'
-        raise UserError("the viewer needs the package viser", "deltas view", remedy)
+    check_extra("view", "viser", wanted_by="the viewer needs", where="deltas view")
 
 
 def check_address(host: str) -> None:
@@ -86,7 +84,7 @@ def open_viewer(
     Raises:
         UserError: viser is not installed, or a file cannot be read.
     """
-    check_extra()
+    check_viewer()
     if maps is not None:
         capture = maps.capture
     shown = capture.frames if maps is None else maps.ids

@@ -141,12 +141,15 @@ def test_a_wrong_name_is_no_baseline(run: Run, folder: Path) -> None:
 
 
 def test_without_pycolmap_the_extra_is_named(
-    run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for name in ("colmap-sparse", "colmap-densified"):
         said = run("evaluate", folder, "--weights", name)
         assert_one_line(said, "pycolmap", 'pip install "deltas-depth[colmap]"')
+    said = run("ablate", "sparse", folder, "--out", tmp_path / "ablations")
+    assert_one_line(said, "pycolmap", 'pip install "deltas-depth[colmap]"')
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_colmap_refuses_what_its_cameras_cannot_say(room: Capture) -> None:

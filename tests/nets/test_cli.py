@@ -325,7 +325,13 @@ def test_train_resume_and_refusal(
 def test_every_command_explains_itself_with_an_example(run: Run, command: str) -> None:
     result = run(command, "--help")
     assert result.code == 0 and "{None}" not in result.out
+    assert "FLOAT FLOAT" not in result.out, "say what the numbers are"
     assert f"Example: deltas {command}" in " ".join(result.out.split())
+
+
+def test_a_number_that_is_missing_is_told(run: Run, tmp_path: Path) -> None:
+    said = run("export", "--depth-range", 1, "--out", tmp_path / "x.pt2")
+    assert_one_line(said, "--depth-range takes 2 values, got fewer", "see deltas export --help")
 
 
 def test_without_arguments_the_help_is_shown(run: Run) -> None:

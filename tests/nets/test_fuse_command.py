@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -334,7 +335,7 @@ def test_flags_that_nothing_would_come_of_are_refused(
 def test_glb_needs_its_extra(
     maps: tuple[Path, Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deltas_nets.fuse.files.find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "trimesh", None)
     result = run("fuse", *maps, "--out", tmp_path / "out", "--glb")
     assert_one_line(result, "trimesh", "deltas-depth[mesh]")
     assert not (tmp_path / "out").exists()

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args, get_type_hints
 
+import numpy as np
 import pytest
 import torch
 from test_encoders import Tiny
 from torch import Tensor
 
+from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.saving import WRITERS
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.command_line import parse
@@ -21,6 +23,11 @@ from deltas_nets.losses import losses
 from deltas_nets.losses.seen import Seen
 from deltas_nets.network.features import Channels
 from deltas_nets.outputs.depth_formats import DEPTH_FORMATS
+from deltas_nets.predict.depth_map import DepthMap, KeypointDepths, PredictConfig, Wanted
+from deltas_nets.predict.look import look
+from deltas_nets.predict.predictor import Predictor
+from deltas_nets.predict.reach import Reach
+from deltas_nets.predict.views_alone import ViewsAlone
 
 
 @pytest.mark.parametrize(
@@ -109,6 +116,36 @@ def test_every_row_can_be_asked_for(
     command: type[Any], flag: str, table: dict[str, object]
 ) -> None:
     assert get_args(get_type_hints(command)[flag]) == tuple(table)
+
+
+class Mine(ViewsAlone):
+    """A network that gives what it is told to."""
+
+    def __init__(self, given: object) -> None:
+        self.given = given
+
+    def depth_map(self, wanted: Wanted) -> object:
+        return self.given
+
+
+def map_of(depth: Any) -> DepthMap:
+    none = KeypointDepths.of(torch.zeros(1, 4, 6))
+    return DepthMap(depth, None, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (None, "must return a DepthMap, got NoneType"),
+        (np.ones((4, 6), np.float32), "must return a DepthMap, got ndarray"),
+        (map_of(torch.ones(4, 6)), r"depth as an ndarray \(4, 6\), got Tensor \(4, 6\)"),
+        (map_of(np.ones((1, 4, 6))), r"depth as an ndarray \(4, 6\), got ndarray \(1, 4, 6\)"),
+    ],
+)
+def test_what_a_network_gives_in_place_of_a_map_is_told(given: object, told: str) -> None:
+    frame = Frame("0", Path("0.jpg"), (4, 6), np.eye(3), np.eye(4))
+    with pytest.raises(TypeError, match=f"Mine.depth_map must .*{told.removeprefix('must ')}"):
+        look(cast(Predictor, Mine(given)), [frame], PredictConfig(), Reach(0.5, 10.0))
 
 
 class Plain(Command):

@@ -1,6 +1,7 @@
 """`deltas recipe`: parts one after the other, each from the weights of the one before."""
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -118,6 +119,7 @@ def test_the_command_trains_and_calibrates(tmp_path: Path, run: Run) -> None:
     result = run("recipe", "night", "--out", out, "--workers", 0)
     assert result.code == 0, result.err
     assert "part 1 of 2: 1-first, 1 steps" in result.out
+    assert result.out.splitlines()[-1] == f"finished weights in {out / 'weights.safetensors'}"
     record = read_metadata(out / "weights.safetensors")
     assert record["step"] == "2" and record["seed"] == "1"
     assert "EfficientNet-Lite0" in record["origin"] and "rooms" in record["calibration"]
@@ -193,6 +195,18 @@ def test_nonsense_is_refused_before_anything_is_written(
     out = tmp_path / "run"
     assert_one_line(run("recipe", "night", "--out", out, "--workers", 0, *arguments), said)
     assert not out.exists() or not any(out.iterdir())
+
+
+@pytest.mark.parametrize(
+    "command", [("train", "--encoder", "none"), ("recipe", "night", "--init", "deltas-small")]
+)
+def test_without_the_extra_of_training_nothing_is_written(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.setitem(sys.modules, "lightning_fabric", None)
+    said = run(*command, "--out", tmp_path / "run")
+    assert_one_line(said, "lightning_fabric", 'pip install "deltas-depth[train]"')
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_of_another_kind_are_refused_before_the_folder_remembers_them(

@@ -11,6 +11,8 @@ import pytest
 from rich.table import Table
 
 from deltas_nets import terminal
+from deltas_nets.config import TrainConfig
+from deltas_nets.train.log import FolderLog
 
 
 def test_progress_is_a_line_now_and_then(
@@ -23,6 +25,21 @@ def test_progress_is_a_line_now_and_then(
             now[0] += 4.0  # s
             report("7")
     assert capsys.readouterr().out.splitlines() == [f"depth: {n} of 12" for n in (3, 6, 9, 12)]
+
+
+def test_training_tells_so_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with FolderLog(tmp_path, TrainConfig(steps=20), step=8, report=print) as log:
+        for step in (9, 10, 11, 12):
+            now[0] += 6.0  # s
+            if step == 11:
+                log.losses(step, {"total": 1.25}, rate=1e-4, seconds=6.0)
+            log.progress(step)
+    told = ["training: 10 of 20", "training: 12 of 20, loss 1.250"]
+    assert capsys.readouterr().out.splitlines() == told
 
 
 def test_what_is_quick_tells_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The viewer: what a browser gets to see of a capture and its maps."""
 
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +30,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 def test_without_viser_the_extra_is_named(
     run: Run, make_capture: MakeCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "viser", None)
     assert_one_line(run("view", make_capture()), "viser", "deltas-depth[view]")
 
 

@@ -1,0 +1,36 @@
+"""Packages that not everybody needs: whether they are there, asked before any work is done."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from deltas_nets.errors import UserError
+
+__all__ = ["check_extra"]
+
+
+def check_extra(
+    extra: str, *packages: str, wanted_by: str, where: str | Path, otherwise: str = ""
+) -> None:
+    """Are the packages of an extra installed?
+
+    Args:
+        extra: its name, as pip takes it.
+        packages: that are needed, as they are imported.
+        wanted_by: what needs them, as a subject in the plural or singular with its verb.
+        where: the command, option or file it is about.
+        otherwise: what can be done without them.
+
+    Raises:
+        UserError: one is missing.
+
+    Example:
+        >>> check_extra("mesh", "no_such_package", wanted_by="GLB needs", where="--glb")
+        Traceback (most recent call last):
+        deltas_nets.errors.UserError: GLB needs the package no_such_package, --glb: pip install \
+"deltas-depth[mesh]"
+    """
+    for package in packages:
+        if find_spec(package) is None:
+            remedy = f'pip install "deltas-depth[{extra}]"'
+            remedy += f", or {otherwise}" if otherwise else ""
+            raise UserError(f"{wanted_by} the package {package}", where, remedy)
