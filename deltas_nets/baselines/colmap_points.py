@@ -12,6 +12,7 @@ from PIL import Image
 from deltas_geom import PosedViews, project
 from deltas_nets.captures.frame import FloatArray, Frame
 from deltas_nets.captures.work_size import anchor_views
+from deltas_nets.errors import UserError
 from deltas_nets.extras import check_extra
 from deltas_nets.predict.depth_map import KeypointDepths
 
