@@ -21,6 +21,7 @@ from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.network.lite.encoder import LiteEncoder
 from deltas_nets.network.prediction import DepthPrediction
 from deltas_nets.predict.depth_map import (
+    WORK_PIXELS,
     DepthMap,
     KeypointDepths,
     PredictConfig,
@@ -33,6 +34,9 @@ from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.without_points import map_without_points
 from deltas_nets.weights_file import weights_record
 
+ENLARGED = 2.0
+"""How many times as long the sides of a photo that is smaller than usual become: places are told
+in parts of what the network sees, and it is surer of small images than it should be."""
 POINT_PIXELS = 192
 """Pixels of an image for each point of a network with 768: of more pixels there are more points, or
 the densifier has too few of them; see decision 26."""
@@ -200,9 +204,14 @@ def complete_frame(
 
 
 def work_size_of(anchor: Frame, config: PredictConfig) -> tuple[int, int]:
-    """(height, width) that the network sees."""
-    most = round(config.work_pixels * anchor.extent)
-    return config.work_size or fit_work_size(anchor.image_size, max_pixels=most)
+    """(height, width) that the network sees: of small photos more than they have."""
+    if config.work_size is not None:
+        return config.work_size
+    height, width = anchor.image_size
+    usual = round(min(config.work_pixels, WORK_PIXELS) * anchor.extent)
+    if height * width < usual:
+        return fit_work_size(anchor.image_size, max_pixels=usual, enlarged=ENLARGED)
+    return fit_work_size(anchor.image_size, max_pixels=round(config.work_pixels * anchor.extent))
 
 
 def num_points(model: Deltas, work_size: tuple[int, int]) -> int:
