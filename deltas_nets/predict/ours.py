@@ -35,8 +35,8 @@ from deltas_nets.predict.without_points import map_without_points
 from deltas_nets.weights_file import weights_record
 
 ENLARGED = 2.0
-"""How many times as long the sides of a photo that is smaller than usual become: places are told
-in parts of what the network sees, and it is surer of small images than it should be."""
+"""How many times as long the sides of photos of fewer than `WORK_PIXELS` become at most: places are
+found to a part of what the network sees as a pixel; see decision 26."""
 POINT_PIXELS = 192
 """Pixels of an image for each point of a network with 768: of more pixels there are more points, or
 the densifier has too few of them; see decision 26."""
@@ -208,10 +208,9 @@ def work_size_of(anchor: Frame, config: PredictConfig) -> tuple[int, int]:
     if config.work_size is not None:
         return config.work_size
     height, width = anchor.image_size
-    usual = round(min(config.work_pixels, WORK_PIXELS) * anchor.extent)
-    if height * width < usual:
-        return fit_work_size(anchor.image_size, max_pixels=usual, enlarged=ENLARGED)
-    return fit_work_size(anchor.image_size, max_pixels=round(config.work_pixels * anchor.extent))
+    enlarged = ENLARGED if height * width < WORK_PIXELS * anchor.extent else 1.0
+    most = round(config.work_pixels * anchor.extent)
+    return fit_work_size(anchor.image_size, max_pixels=most, enlarged=enlarged)
 
 
 def num_points(model: Deltas, work_size: tuple[int, int]) -> int:

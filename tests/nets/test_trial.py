@@ -16,7 +16,6 @@ from deltas_nets import load_model
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.spread import spread
 from deltas_nets.captures.view_sets import ViewSet
-from deltas_nets.captures.work_size import fit_work_size
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict import trial
 from deltas_nets.predict.depth_map import (
@@ -91,24 +90,23 @@ def test_nothing_is_tried_where_nothing_is_to_be_chosen(capture: Capture) -> Non
     assert alone.seen == network.seen == []
 
 
-@pytest.mark.parametrize("size", [(48, 64), (120, 160), (240, 320), (270, 180)])
-def test_small_photos_are_enlarged_and_nothing_is_tried_with_them(
-    capture: Capture, size: tuple[int, int]
+@pytest.mark.parametrize(
+    ("photo", "usual", "larger"),
+    [
+        ((48, 64), (96, 128), (96, 128)),
+        ((120, 160), (240, 320), (240, 320)),
+        ((240, 320), (288, 384), (480, 640)),
+        ((360, 540), (272, 416), (352, 528)),
+        ((480, 640), (288, 384), (480, 640)),
+        ((3000, 4000), (288, 384), (480, 640)),
+    ],
+)
+def test_photos_are_enlarged_to_what_the_network_wants_or_twice_their_sides(
+    capture: Capture, photo: tuple[int, int], usual: tuple[int, int], larger: tuple[int, int]
 ) -> None:
-    photo = replace(capture.frame("0"), image_size=size)
-    seen = work_size_of(photo, PredictConfig())
-    most = min(4 * size[0] * size[1], WORK_PIXELS)
-    assert 0.85 * most < seen[0] * seen[1] <= most
-    assert work_size_of(photo, with_larger_images(PredictConfig())) == seen
-    assert work_size_of(photo, SMALL) == fit_work_size(size, max_pixels=SMALL.work_pixels)
-
-
-@pytest.mark.parametrize("size", [(360, 540), (480, 640), (3000, 4000)])
-def test_photos_of_usual_size_are_never_enlarged(capture: Capture, size: tuple[int, int]) -> None:
-    photo = replace(capture.frame("0"), image_size=size)
-    for config in (PredictConfig(), with_larger_images(PredictConfig())):
-        expected = fit_work_size(size, max_pixels=config.work_pixels)
-        assert work_size_of(photo, config) == expected
+    frame, config = replace(capture.frame("0"), image_size=photo), PredictConfig()
+    assert work_size_of(frame, config) == usual
+    assert work_size_of(frame, with_larger_images(config)) == larger
 
 
 @given(gains=st.lists(st.floats(-1, 1), min_size=1, max_size=TRIED))
