@@ -72,6 +72,13 @@ def test_a_K_in_parts_of_the_image_is_multiplied(whole: Capture) -> None:
     assert np.allclose(found.mend(planted).frames.K, whole.frames.K)
 
 
+def test_what_looks_like_another_size_may_be_a_crop(whole: Capture) -> None:
+    shift = np.array([[0.0, 0, -20], [0, 0, -15], [0, 0, 0]])
+    planted = frames(lambda _, f: replace(f, K=f.K + shift, image_size=(81, 108)))(whole)
+    (found,) = (one for one in quick_findings(planted) if one.cause is Fault.K_OF_OTHER_SIZE)
+    assert found.cure.startswith("unless photos are cropped, scale it")
+
+
 def test_both_units_that_poses_may_have_are_told(whole: Capture) -> None:
     (found,) = quick_findings(CAMERAS["millimetres"][0](whole))
     assert "centimetres" in found.cure and "millimetres" in found.cure
