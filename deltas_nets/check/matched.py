@@ -24,7 +24,7 @@ GROUPS = 6
 LEAST = 24  # matches with which two frames go together
 MOTION = 0.06  # of the width, wanted between neighbours in a group
 _LONGEST_STRIDE = 16
-_AHEAD = np.cos(np.radians(10))  # frames turned by less look at the same
+_AHEAD = np.radians(10)  # frames turned by less look at the same
 
 
 class Matched(NamedTuple):
@@ -184,9 +184,14 @@ def _joined(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> Matched:
 def _alone(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> tuple[int, ...]:
     """Frames between two of a group, one before and one after, neither of which they match.
 
-    Of a camera that looked elsewhere meanwhile frames between two match neither, and are right.
+    Of a camera that looked elsewhere meanwhile, or was turned to take a portrait, frames between
+    two match neither, and are right.
     """
-    axes = looked.frames.cam_from_world[:, 2, :3]
+    rotations = looked.frames.cam_from_world[:, :3, :3]
+
+    def turned(one: int, other: int) -> float:
+        return float(np.arccos(np.clip(((rotations[one] * rotations[other]).sum() - 1) / 2, -1, 1)))
+
     matched = {position for group in groups for position in group}
     described = [position for position, seen in looked.known.items() if seen is not None]
     alone = []
@@ -195,8 +200,8 @@ def _alone(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> tuple[int, .
             before = max((other for other in group if other < position), default=None)
             after = min((other for other in group if other > position), default=None)
             if before is not None and after is not None:
-                least = min(float(axes[before] @ axes[after]), _AHEAD)
-                if min(axes[[before, after]] @ axes[position]) < least:
+                most = max(turned(before, after), _AHEAD)
+                if max(turned(before, position), turned(position, after)) > most:
                     break
                 if not any(looked.match(position, other) for other in (before, after)):
                     alone.append(position)

@@ -224,11 +224,14 @@ class Described(NamedTuple):
         return False
 
 
-@pytest.mark.parametrize(("degrees", "accused"), [(4, (1,)), (30, ())])
-def test_frames_that_look_elsewhere_need_not_match(degrees: float, accused: tuple[int]) -> None:
+@pytest.mark.parametrize(
+    ("turn", "accused"), [((0, 4, 0), (1,)), ((0, 30, 0), ()), ((0, 0, 90), ())]
+)
+def test_frames_that_look_elsewhere_or_are_turned_need_not_match(
+    turn: tuple[float, float, float], accused: tuple[int]
+) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
-    turn = np.radians(degrees)
-    poses[1, :3, :3] = cv2.Rodrigues(np.array([0.0, turn, 0.0]))[0]
+    poses[1, :3, :3] = cv2.Rodrigues(np.radians(turn))[0]
     known = dict.fromkeys(range(3), True)
     described = Described(SimpleNamespace(cam_from_world=poses), known)
     nowhere = torch.zeros(0, 2)

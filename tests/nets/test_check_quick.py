@@ -133,6 +133,16 @@ def test_depth_that_no_command_can_read_is_named(whole: Capture) -> None:
     assert "pixels of type L" in found.evidence and len(found.frames) == 9
 
 
+def test_a_portrait_is_as_sharp_as_the_landscapes_around_it(whole: Capture) -> None:
+    for number, frame in enumerate(whole.frames.values()):
+        pixels = np.random.default_rng(number).integers(0, 255, (60, 96, 1), dtype=np.uint8)
+        large = Image.fromarray(np.repeat(pixels, 3, axis=-1)).resize((1000, 240))
+        if number == 4:
+            large = large.transpose(Image.Transpose.ROTATE_90)
+        large.save(frame.image_path, quality=95)
+    assert look_at_images(whole) == []
+
+
 def test_blurred_broken_and_repeated_images_are_named(whole: Capture) -> None:
     files = {id: frame.image_path for id, frame in whole.frames.items()}
     Image.open(files["2"]).filter(ImageFilter.GaussianBlur(3)).save(files["2"], quality=95)
