@@ -32,6 +32,8 @@ MAX_BASELINE = 0.25  # in working depths; beyond, a frame is not even scored
 MIN_BASELINE = 0.01
 MIN_OVERLAP = 0.4
 MAX_ANGLE = np.radians(45)
+MAX_ROLL = np.radians(45)
+"""Images turned farther about the axis, as portrait is beside landscape, hardly match."""
 GOOD_ANGLE = np.radians(15)  # where the penalty of the viewing angle reaches exp(-1/2)
 NEAREST = 0.04  # in working depths; what is nearer to a candidate does not count as seen
 COVERAGE = 6.0
@@ -109,12 +111,13 @@ def choose_views(
     for id in wanted:
         anchor = index_of[id]
         depth = float(depths[anchor]) if depths is not None else working_depth or 0.0
-        near = _candidates(centres, poses[:, 2, :3], anchor, depth, num_views - 1)
+        near = _candidates(centres, poses[:, :3, :3], anchor, depth, num_views - 1)
         probes, nearest = _probes(capture, anchor, depth), NEAREST * depth
         seen = seen_places(capture.frames, near, probes, poses[anchor], nearest=nearest)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
         angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
-        log_score, hindered = _rate(offsets, angles, seen.mean(axis=-1), depth)
+        rolls = _rolls(poses[near, :3, :3], poses[anchor, :3, :3])
+        log_score, hindered = _rate(offsets, angles, rolls, seen.mean(axis=-1), depth)
         acceptable = hindered == ""
         if acceptable.sum() < min(num_views, len(ids)) - 1:
             short[Counter(hindered[~acceptable]).most_common(1)[0][0]] += 1
@@ -127,17 +130,18 @@ def choose_views(
 
 
 def _candidates(
-    centres: FloatArray, axes: FloatArray, anchor: int, working_depth: float, wanted: int
+    centres: FloatArray, rotations: FloatArray, anchor: int, working_depth: float, wanted: int
 ) -> NDArray[np.intp]:
     """Indices of the frames worth projecting into: near a good baseline, looking alike.
 
     Everything is ranked, so that a frame far from all others still has candidates.
     """
     baseline = np.linalg.norm(centres - centres[anchor], axis=-1) / working_depth
-    angle = _angles(axes, axes[anchor])
+    angle = _angles(rotations[:, 2], rotations[anchor, 2])
+    turned = _rolls(rotations, rotations[anchor]) > MAX_ROLL
     cost = -_baseline_log_score(baseline) + 0.5 * (angle / GOOD_ANGLE) ** 2
     # Behind all that are near enough, but ranked.
-    cost += np.where((baseline > MAX_BASELINE) | (angle > MAX_ANGLE), 1e6, 0.0)
+    cost += np.where((baseline > MAX_BASELINE) | (angle > MAX_ANGLE) | turned, 1e6, 0.0)
     cost[anchor] = np.inf
     count = min(max(MAX_CANDIDATES, wanted), len(centres) - 1)
     nearest = np.argpartition(cost, count - 1)[:count]
@@ -149,6 +153,14 @@ def _angles(axes: FloatArray, axis: FloatArray) -> FloatArray:
     """Angles between viewing directions (third rows of cam_from_world), rad."""
     angles: FloatArray = np.arccos(np.clip(axes @ axis, -1.0, 1.0))
     return angles
+
+
+def _rolls(rotations: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Angles ``(C,)`` by which cameras are turned about their axes, 0 to pi, rad."""
+    turns = rotations @ rotation.T
+    sine, cosine = turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]
+    rolls: FloatArray = np.abs(np.arctan2(sine, cosine))
+    return rolls
 
 
 def _baseline_log_score(baseline: FloatArray) -> FloatArray:
@@ -188,7 +200,11 @@ def _rays(capture: Capture, position: int, pixels: FloatArray) -> FloatArray:
 
 
 def _rate(
-    offsets: FloatArray, angles: FloatArray, overlap: FloatArray, working_depth: float
+    offsets: FloatArray,
+    angles: FloatArray,
+    rolls: FloatArray,
+    overlap: FloatArray,
+    working_depth: float,
 ) -> tuple[FloatArray, NDArray[np.str_]]:
     """Log scores of candidates and what makes them unfit, "" if nothing; in the anchor's axes."""
     baseline = np.linalg.norm(offsets, axis=-1) / working_depth
@@ -202,9 +218,16 @@ def _rate(
             baseline < MIN_BASELINE,
             baseline > MAX_BASELINE,
             angles > MAX_ANGLE,
+            rolls > MAX_ROLL,
             overlap < MIN_OVERLAP,
         ],
-        ["stand in the same place", "stand too far away", "look elsewhere", "see little of it"],
+        [
+            "stand in the same place",
+            "stand too far away",
+            "look elsewhere",
+            "are turned",
+            "see little of it",
+        ],
         default="",
     )
     return score, hindered

@@ -86,22 +86,35 @@ def camera_at(frame: Frame, size: tuple[int, int]) -> PosedViews:
     return PosedViews(K[None], torch.tensor(frame.cam_from_world)[None])
 
 
-def fit_work_size(image_size: tuple[int, int], *, max_pixels: int = 240 * 320) -> tuple[int, int]:
+def fit_work_size(
+    image_size: tuple[int, int], *, max_pixels: int = 240 * 320, enlarged: float = 1.0
+) -> tuple[int, int]:
     """The size to work at: the aspect ratio of the image, at most so many pixels.
 
     Both sides are multiples of ``MULTIPLE``; among those that fit the one that keeps the
-    aspect ratio best for its area. Images are never enlarged, except to one multiple.
+    aspect ratio best for its area.
+
+    Args:
+        image_size: (height, width).
+        max_pixels: of the result.
+        enlarged: how many times as long its sides may be; by 1 no image is enlarged, except to
+            one multiple.
+
+    Raises:
+        ValueError: no size fits.
 
     Example:
         >>> fit_work_size((480, 640))
         (240, 320)
         >>> fit_work_size((360, 540))
         (224, 336)
+        >>> fit_work_size((120, 160), enlarged=2.0)
+        (240, 320)
     """
     height, width = image_size
     if height < 1 or width < 1 or max_pixels < MULTIPLE * MULTIPLE:
         raise ValueError(f"no size with multiples of {MULTIPLE} fits {image_size=}, {max_pixels=}")
-    scale = min(1.0, (max_pixels / (height * width)) ** 0.5)
+    scale = min(enlarged, (max_pixels / (height * width)) ** 0.5)
     best: tuple[float, tuple[int, int]] | None = None
     for rows in _multiples_around(height * scale):
         for columns in _multiples_around(width * scale):

@@ -19,7 +19,7 @@ __all__ = ["look_at_images"]
 MOST = 400
 """Images that are looked at; of more, every second, third, ..."""
 THUMB = (72, 96)
-WIDTH = 320  # at which sharpness is judged
+WIDTH = 320  # of the longer side, at which sharpness is judged
 SAME = 0.6  # of 255, mean difference of thumbs that show the same
 BLURRED = 0.28  # of its neighbours' sharpness
 _NEIGHBOURS = 5  # on either side
@@ -73,8 +73,9 @@ def _look(frame: Frame, position: int) -> _Seen | str:
                 return f"pixels of type {image.mode}, not 8-bit colour"
             image.draft("L", (WIDTH, WIDTH * 2 // 3))
             grey = image.convert("L")
-            width = min(WIDTH, grey.width)
-            height = max(8, width * grey.height // grey.width)
+            # Of the longer side: a portrait is looked at as finely as the landscapes around it.
+            share = min(1.0, WIDTH / max(grey.size))
+            width, height = (max(8, int(share * side)) for side in grey.size)
             small = grey.resize((width, height), Image.Resampling.BOX)
             thumb = small.resize(THUMB[::-1], Image.Resampling.BOX)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -86,10 +87,10 @@ def _sharpness(grey: NDArray[np.float32]) -> float:
     """Variance of second differences over that of first: what blur takes first."""
     if min(grey.shape) < 3:
         return 1.0  # too small to tell
-    across = np.diff(grey, axis=1)
+    first = (np.diff(grey, axis=0).var() + np.diff(grey, axis=1).var()) / 2
     inner = grey[1:-1, 1:-1]
     second = 4 * inner - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
-    return float(second.var() / (across.var() + 1))
+    return float(second.var() / (first + 1))
 
 
 def _blurred(capture: Capture, seen: list[_Seen]) -> list[Finding]:

@@ -161,7 +161,8 @@ def _of_other_images(K: FloatArray, image_size: tuple[int, int], centre: float) 
         # A principal point is in the middle within a few parts of a hundred.
         factor = common(factor, within=0.04)
         other = of_size(K, factor)
-        cure = f"scale it: K times {factor:.4g} is {in_a_line(other, centre)}"
+        cure = f"unless photos are cropped, scale it: K times {factor:.4g} is "
+        cure += in_a_line(other, centre)
         return Suspicion(Fault.K_OF_OTHER_SIZE, evidence, cure, other)
     if max(abs(right), abs(down)) > 0.5:
         evidence = f"{point} is outside of them"

@@ -31,6 +31,8 @@ __all__ = ["Figures", "judge_matches"]
 
 _LEAST_PAIRS = 3
 _MOSTLY = 0.6  # of the pairs must fit before depth is held against cameras
+_ENOUGH_PAIRS = 6
+"""Of fewer, which cameras fit, what is left of residuals is explained by almost anything."""
 
 
 class Figures(NamedTuple):
@@ -106,6 +108,10 @@ def _by_sensor(capture: Capture, matched: Matched, evidence: Evidence) -> list[F
 def _explained(case: Case) -> list[Finding]:
     capture, matched, evidence, given = case
     diagnosis = diagnosed(capture, matched)
+    if diagnosis.cause is Cause.NO_BASELINE:
+        return [_no_baseline(diagnosis)]
+    if level(given) <= ENOUGH and len(evidence.pairs) < _ENOUGH_PAIRS:
+        return []
     suspects = [
         suspect
         for suspect in (
@@ -117,8 +123,6 @@ def _explained(case: Case) -> list[Finding]:
         )
         if suspect is not None
     ]
-    if diagnosis.cause is Cause.NO_BASELINE:
-        return [_no_baseline(diagnosis)]
     if not suspects and level(given) > ENOUGH:
         axes = other_axes(case)
         others = [] if axes is None else [axes]

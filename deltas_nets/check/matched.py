@@ -24,6 +24,7 @@ GROUPS = 6
 LEAST = 24  # matches with which two frames go together
 MOTION = 0.06  # of the width, wanted between neighbours in a group
 _LONGEST_STRIDE = 16
+_AHEAD = np.radians(10)  # frames turned by less look at the same
 
 
 class Matched(NamedTuple):
@@ -181,7 +182,16 @@ def _joined(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> Matched:
 
 
 def _alone(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> tuple[int, ...]:
-    """Frames between two of a group, one before and one after, neither of which they match."""
+    """Frames between two of a group, one before and one after, neither of which they match.
+
+    Of a camera that looked elsewhere meanwhile, or was turned to take a portrait, frames between
+    two match neither, and are right.
+    """
+    rotations = looked.frames.cam_from_world[:, :3, :3]
+
+    def turned(one: int, other: int) -> float:
+        return float(np.arccos(np.clip(((rotations[one] * rotations[other]).sum() - 1) / 2, -1, 1)))
+
     matched = {position for group in groups for position in group}
     described = [position for position, seen in looked.known.items() if seen is not None]
     alone = []
@@ -190,6 +200,9 @@ def _alone(looked: _Looked, groups: Sequence[dict[int, Tensor]]) -> tuple[int, .
             before = max((other for other in group if other < position), default=None)
             after = min((other for other in group if other > position), default=None)
             if before is not None and after is not None:
+                most = max(turned(before, after), _AHEAD)
+                if max(turned(before, position), turned(position, after)) > most:
+                    break
                 if not any(looked.match(position, other) for other in (before, after)):
                     alone.append(position)
                 break

@@ -64,8 +64,8 @@ def verdict(records: Sequence[Mapping[str, Any]], *, short: int = 0) -> Verdict:
         words.append(f"{counted(short, 'view set')} short of views")
     if low:
         words.append(
-            "which is low: views are too near to each other, surfaces too plain, or poses or "
-            "intrinsics wrong; deltas check tells which"
+            "which is low: views are too near to each other or too far apart, surfaces too plain, "
+            "or poses or intrinsics wrong; deltas check tells which"
         )
     factors = [record["measured_factor"] for record in records if "measured_factor" in record]
     apart = bool(factors) and not 1 / USUAL_FACTOR < median(factors) < USUAL_FACTOR

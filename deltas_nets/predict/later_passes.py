@@ -11,7 +11,7 @@ from deltas_geom import PosedViews
 from deltas_nets.agree.agreed import agreed
 from deltas_nets.agree.heard import Heard
 from deltas_nets.agree.held import held
-from deltas_nets.agree.neighbours import neighbours, sample
+from deltas_nets.agree.neighbours import APART, neighbours, sample
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.measured import MeasuredDepth
 from deltas_nets.captures.spread import spread
@@ -72,7 +72,7 @@ class LaterPasses:
             views.append(found.view)
             sizes.append((found.map.depth.shape[-2], found.map.depth.shape[-1]))
         cameras = PosedViews(*(torch.cat(parts) for parts in zip(*views, strict=True)))
-        around = neighbours(torch.stack(points), cameras, sizes)
+        around = neighbours(torch.stack(points), cameras, sizes, apart=APART)
         self._around = {id: [ids[n] for n in near] for id, near in zip(ids, around, strict=True)}
 
     @torch.inference_mode()

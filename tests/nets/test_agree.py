@@ -252,6 +252,17 @@ def test_neighbours_are_those_that_share_most() -> None:
         assert all(own in found[other] for other in near)
 
 
+def test_of_cameras_that_stand_in_one_place_one_is_heard() -> None:
+    views = [camera(x) for x in (0.0, 0.004, 0.4, 0.404, 0.408, 0.8)]
+    points = torch.stack([sample(wall(view)[0], view) for view in views])
+    cameras = PosedViews(*(torch.cat(parts) for parts in zip(*views, strict=True)))
+    found = neighbours(points, cameras, [SIZE] * 6, apart=0.005)  # of a wall 3 m away: 15 mm
+    assert [len(near) for near in found] == [2] * 6
+    assert set(found[0]) & {2, 3, 4} and 5 in found[0]
+    assert set(found[5]) & {0, 1} and set(found[5]) & {2, 3, 4}
+    assert all(len(near) == 5 for near in neighbours(points, cameras, [SIZE] * 6))
+
+
 def test_what_has_no_depth_is_seen_by_nobody() -> None:
     behind = camera(0.0, -1.0)  # it sees where the other camera stands
     views = [camera(0.0), behind]

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +20,7 @@ from deltas_nets.captures.saving import save_capture
 from deltas_nets.check import scale
 from deltas_nets.check.finding import Fault, Finding
 from deltas_nets.check.judging import judge_matches
-from deltas_nets.check.matched import Matched, match_capture
+from deltas_nets.check.matched import Matched, _alone, match_capture
 from deltas_nets.check.quick import quick_findings
 from deltas_nets.check.verdict import check_capture
 from deltas_nets.rooms import render_room
@@ -197,6 +199,43 @@ def test_three_matches_in_ten_may_be_wrong(fault: str, look: Look) -> None:
         assert looked.judged(capture) == []
     else:
         assert_named_and_mended(looked, fault)
+
+
+@pytest.mark.parametrize(("frames", "causes"), [(2, []), (4, [Fault.K_OF_OTHER_SIZE])])
+def test_a_pair_that_nearly_fits_accuses_no_camera(
+    frames: int, causes: list[Fault], look: Look
+) -> None:
+    looked = look("room")
+    some = [
+        replace(frame, K=np.diag([1.1, 1.1, 1.0]) @ frame.K)
+        for frame in list(looked.capture.frames.values())[:frames]
+    ]
+    planted = replace(looked.capture, frames=Frames.of(some, looked.capture.frames.folder))
+    assert [found.cause for found in looked.judged(planted)] == causes
+
+
+class Described(NamedTuple):
+    """Three frames of which the middle one matches none."""
+
+    frames: SimpleNamespace
+    known: dict[int, bool]
+
+    def match(self, one: int, other: int) -> bool:
+        return False
+
+
+@pytest.mark.parametrize(
+    ("turn", "accused"), [((0, 4, 0), (1,)), ((0, 30, 0), ()), ((0, 0, 90), ())]
+)
+def test_frames_that_look_elsewhere_or_are_turned_need_not_match(
+    turn: tuple[float, float, float], accused: tuple[int]
+) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, :3, :3] = cv2.Rodrigues(np.radians(turn))[0]
+    known = dict.fromkeys(range(3), True)
+    described = Described(SimpleNamespace(cam_from_world=poses), known)
+    nowhere = torch.zeros(0, 2)
+    assert _alone(described, [{0: nowhere, 2: nowhere}]) == accused  # type: ignore[arg-type]
 
 
 def test_frames_that_share_nothing_say_that_nothing_can_be_told(look: Look) -> None:

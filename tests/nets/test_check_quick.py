@@ -72,6 +72,13 @@ def test_a_K_in_parts_of_the_image_is_multiplied(whole: Capture) -> None:
     assert np.allclose(found.mend(planted).frames.K, whole.frames.K)
 
 
+def test_what_looks_like_another_size_may_be_a_crop(whole: Capture) -> None:
+    shift = np.array([[0.0, 0, -20], [0, 0, -15], [0, 0, 0]])
+    planted = frames(lambda _, f: replace(f, K=f.K + shift, image_size=(81, 108)))(whole)
+    (found,) = (one for one in quick_findings(planted) if one.cause is Fault.K_OF_OTHER_SIZE)
+    assert found.cure.startswith("unless photos are cropped, scale it")
+
+
 def test_both_units_that_poses_may_have_are_told(whole: Capture) -> None:
     (found,) = quick_findings(CAMERAS["millimetres"][0](whole))
     assert "centimetres" in found.cure and "millimetres" in found.cure
@@ -124,6 +131,16 @@ def test_depth_that_no_command_can_read_is_named(whole: Capture) -> None:
     (found,) = unreadable_depth(whole)
     assert found.cause is Fault.DEPTH_UNREADABLE and found.severity == "warning"
     assert "pixels of type L" in found.evidence and len(found.frames) == 9
+
+
+def test_a_portrait_is_as_sharp_as_the_landscapes_around_it(whole: Capture) -> None:
+    for number, frame in enumerate(whole.frames.values()):
+        pixels = np.random.default_rng(number).integers(0, 255, (60, 96, 1), dtype=np.uint8)
+        large = Image.fromarray(np.repeat(pixels, 3, axis=-1)).resize((1000, 240))
+        if number == 4:
+            large = large.transpose(Image.Transpose.ROTATE_90)
+        large.save(frame.image_path, quality=95)
+    assert look_at_images(whole) == []
 
 
 def test_blurred_broken_and_repeated_images_are_named(whole: Capture) -> None:

@@ -272,7 +272,8 @@ def test_the_scale_does_not_depend_on_what_is_written(
 def test_a_verdict_doubts_low_confidence_and_few_points() -> None:
     good = {"confidence": 0.55, "valid_points": 700, "keypoints": 768}
     assert not verdict([good] * 3).doubtful
-    assert verdict([good | {"confidence": 0.15}] * 2 + [good]).doubtful
+    low = verdict([good | {"confidence": 0.15}] * 2 + [good])
+    assert low.doubtful and "too near to each other or too far apart" in low.line
     assert verdict([good | {"valid_points": 9}] * 2 + [good]).doubtful
     assert "2 view sets" in verdict([good], short=2).line
     assert not verdict([{"status": "kept"}]).doubtful

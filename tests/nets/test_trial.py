@@ -90,6 +90,25 @@ def test_nothing_is_tried_where_nothing_is_to_be_chosen(capture: Capture) -> Non
     assert alone.seen == network.seen == []
 
 
+@pytest.mark.parametrize(
+    ("photo", "usual", "larger"),
+    [
+        ((48, 64), (96, 128), (96, 128)),
+        ((120, 160), (240, 320), (240, 320)),
+        ((240, 320), (288, 384), (480, 640)),
+        ((360, 540), (272, 416), (352, 528)),
+        ((480, 640), (288, 384), (480, 640)),
+        ((3000, 4000), (288, 384), (480, 640)),
+    ],
+)
+def test_photos_are_enlarged_to_what_the_network_wants_or_twice_their_sides(
+    capture: Capture, photo: tuple[int, int], usual: tuple[int, int], larger: tuple[int, int]
+) -> None:
+    frame, config = replace(capture.frame("0"), image_size=photo), PredictConfig()
+    assert work_size_of(frame, config) == usual
+    assert work_size_of(frame, with_larger_images(config)) == larger
+
+
 @given(gains=st.lists(st.floats(-1, 1), min_size=1, max_size=TRIED))
 def test_the_mean_of_what_is_gained_decides(gains: list[float]) -> None:
     config = PredictConfig(min_confidence=0.2)

@@ -164,6 +164,17 @@ def test_a_camera_that_looks_elsewhere_is_not_chosen() -> None:
     assert choose_view_sets(capture, 3, anchors=[0]) == (ViewSet("0", ("2",)),)
 
 
+def test_portrait_and_landscape_do_not_go_together() -> None:
+    sideways = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    upright = along_x(*0.1 * np.arange(10)).frames.values()
+    frames = [
+        replace(frame, cam_from_world=sideways @ frame.cam_from_world) if place % 2 else frame
+        for place, frame in enumerate(upright)
+    ]
+    for anchor, sources in choose_view_sets(Capture(Path("capture"), Frames.of(frames), {}), 3):
+        assert len(sources) == 2 and {int(id) % 2 for id in (anchor, *sources)} == {int(anchor) % 2}
+
+
 def test_without_an_acceptable_source_the_best_is_taken() -> None:
     capture = along_x(0.0, 3.0, 5.0)
     assert choose_view_sets(capture, 2, anchors=[0]) == (ViewSet("0", ("1",)),)
