@@ -27,7 +27,7 @@ WITH_POINTS = {
 def test_the_error_says_that_they_are_commas(layout: str, tmp_path: Path) -> None:
     path = tmp_path / "capture"
     if layout.startswith("COLMAP"):
-        capture = open_capture(ALL["MVSNet"](tmp_path / "in", make_scene()).path)
+        capture = open_capture(ALL["ARKitScenes"](tmp_path / "in", make_scene()).path)
         save_capture(capture, path, "colmap")
     else:
         path = ALL[layout](path, make_scene()).path
