@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
 from deltas_geom.testing.fixed_scenes import scenes_for, seeded_scene
@@ -35,7 +35,7 @@ def check(name: str, target: Target) -> Outcome:
     if not invariant.offered_by(target):
         return Outcome(name, target.name, "-")
     for make in scenes_for(invariant):
-        scene = make()
+        scene = _made(make)
         try:
             invariant(target, scene)
         except Exception as error:  # whatever another's code raises is its failure
@@ -47,6 +47,12 @@ def check(name: str, target: Target) -> Outcome:
             example = "\n".join([f"{_call(make)}: {kind}{error}", *remarks, scene.sketch()])
             return Outcome(name, target.name, "FAIL", example)
     return Outcome(name, target.name, "pass")
+
+
+@cache
+def _made(make: partial[Any]) -> Any:
+    """A scene, made once: whoever is asked about it is given copies."""
+    return make()
 
 
 def conformance(targets: Iterable[Target]) -> list[Outcome]:

@@ -206,6 +206,12 @@ _DEPTHS = (
     partial(seeded_depths, 3, num_points=24, image_size=(3, 4)),
 )
 _OTHERS: dict[str, tuple[partial[Any], ...]] = {
+    "ties": tuple(partial(named_scene, name) for name in _TIES),
+    "named": tuple(
+        partial(named_scene, name, dtype=dtype)
+        for name in DEGENERATE_SCENES
+        for dtype in (torch.float64, torch.float32)
+    ),
     "segments": _SEGMENTS,
     "maps": _MAPS,
     "scores": _SCORES,
@@ -218,13 +224,4 @@ def scenes_for(invariant: Invariant) -> list[partial[Any]]:
     if invariant.scenes == "posed":
         least = invariant.least_views
         return [make for make in _POSED if make.keywords.get("num_views", 2) >= least]
-    if invariant.scenes == "ties":
-        return [partial(named_scene, name) for name in _TIES]
-    if invariant.scenes == "named":
-        dtypes = (torch.float64, torch.float32)
-        return [
-            partial(named_scene, name, dtype=dtype)
-            for name in DEGENERATE_SCENES
-            for dtype in dtypes
-        ]
     return list(_OTHERS[invariant.scenes])
