@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from deltas_nets.errors import UserError
+from deltas_nets.network.torch_file import all_finite
 from deltas_nets.reference.network import ReferenceNetwork
 
 ENTRIES = ("state_dict", "state_dict_tri", "state_dict_depth")
@@ -107,7 +108,7 @@ def check_table(parts: Sequence[nn.Module], table: Any, entry: str, where: str |
                 where,
                 _REMEDY,
             )
-        if not torch.as_tensor(table[key]).isfinite().all():
+        if not all_finite(torch.as_tensor(table[key])):
             raise UserError(f"{key} of {entry} is not finite", where, _REMEDY)
     left = [key for key in table if key not in expected and not str(key).startswith(_UNUSED)]
     if left:

@@ -82,7 +82,13 @@ def test_weights_are_found_where_authors_keep_them(tmp_path: Path) -> None:
     assert state.keys() == MANY.keys() and torch.equal(state["a"], MANY["a"])
 
 
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    torch.save(MANY | {"b": torch.tensor([0.0, float("inf")])}, tmp_path / "file.pt")
+@pytest.mark.parametrize("kind", [torch.float64, torch.bfloat16, torch.float8_e4m3fn], ids=str)
+@pytest.mark.parametrize("number", [torch.inf, -torch.inf, torch.nan])
+def test_weights_that_are_not_finite_are_refused(
+    number: float, kind: torch.dtype, tmp_path: Path
+) -> None:
+    if kind.itemsize == 1:
+        number = torch.nan  # it has no infinity
+    torch.save(MANY | {"b": torch.tensor([0.0, number, 1.0]).to(kind)}, tmp_path / "file.pt")
     with pytest.raises(UserError, match=r"the weights are not finite \(b\), .*file.pt"):
         read_state(tmp_path / "file.pt")
