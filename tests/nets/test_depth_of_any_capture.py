@@ -65,7 +65,7 @@ def test_the_unit_of_a_capture_is_that_of_its_maps(
     monkeypatch.chdir(tmp_path)
     found = {}
     for name in ("metres", "own-unit", "bent"):
-        said = run("depth", rooms[name], "--view-sets", rooms["sets.json"])
+        said = run("depth", rooms[name], "--view-sets", rooms["sets.json"], "--work-size", 96, 128)
         assert said.code == 0, said.err
         out = tmp_path / f"{name}-depth"
         summary = summary_of(out)
