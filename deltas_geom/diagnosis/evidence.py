@@ -42,9 +42,7 @@ class Evidence(NamedTuple):
 def gather_evidence(pixels: Tensor, seen: Tensor) -> Evidence:
     """Pairs of views with the most matches, about five for each or more view.
 
-    Args:
-        pixels: ``(V, N, 2)`` float64, finite where seen.
-        seen: ``(V, N)`` bool.
+    Pixels are ``(V, N, 2)`` float64, finite where ``seen``.
     """
     pairs = choose_pairs(seen)
     both = seen[pairs[:, 0]] & seen[pairs[:, 1]]

@@ -28,9 +28,7 @@ from deltas_geom.numerics.vectors import Numbers
 def rows(proj: Numbers, pixels: Numbers) -> Numbers:
     """A without weights: the equations ``(*B, N, V, 2, 4)`` of N points, two of each view.
 
-    Args:
-        proj: ``(*B, N, V, 3, 4)`` rows p1, p2, p3; tensor or array.
-        pixels: ``(*B, N, V, 2)``, likewise.
+    Of cameras ``(*B, N, V, 3, 4)`` and pixels ``(*B, N, V, 2)``, tensors or arrays.
     """
     equations: Numbers = pixels[..., None] * proj[..., 2:, :] - proj[..., :2, :]
     return equations

@@ -37,14 +37,8 @@ def second_derivative(
 ) -> Symmetric3:
     """Second derivative by points of half the sum of w^2 rho(e^2), e the reprojection errors.
 
-    Args:
-        normal: J^T W^2 J with the weights w^2 rho', six ``(*B, N)``.
-        proj: ``(*B, V, 3, 4)``.
-        place: x and y ``(*B, V, N)`` px of the projected points.
-        offset: x and y ``(*B, V, N)`` px of the errors.
-        inverse: ``(*B, V, N)`` 1 / depth.
-        influence: ``(*B, V, N)`` w^2 rho'.
-        bend: ``(*B, V, N)`` 2 w^2 rho''.
+    From J^T W^2 J with the weights w^2 rho' and, each ``(*B, V, N)``: x and y of the projected
+    points and of the errors, 1 / depth, w^2 rho' and 2 w^2 rho''.
     """
     (x, y), (dx, dy) = place, offset
     p1, p2, p3 = proj[..., :3].unsqueeze(-2).unbind(dim=-3)  # (*B, V, 1, 3)

@@ -22,7 +22,7 @@ def test_wrong_arguments_are_named() -> None:
         refine_points(proj, pixels, points, loss="l1")
     with pytest.raises(ValueError, match="or 'implicit', got 'none'"):
         refine_points(proj, pixels, points, gradient="none")
-    with pytest.raises(ValueError, match="steps must not be negative, got -1"):
+    with pytest.raises(ValueError, match="steps must be 0 or more, got -1"):
         refine_points(proj, pixels, points, steps=-1)
     with pytest.raises(ValueError, match="scale must be positive, got 0"):
         refine_points(proj, pixels, points, scale=0)

@@ -38,14 +38,9 @@ class Table(NamedTuple):
     ends: float
 
     def read(self, squared: Array, place: Array, index: Array, work: Array, out: Array) -> None:
-        """Values at squared radii, into ``out``; from ``exact`` on those of places before it.
+        """Values at squared radii ``(N,)``, into ``out``; from ``exact`` on those of places before.
 
-        Args:
-            squared: ``(N,)`` not negative.
-            place: ``(N,)`` to work in.
-            index: ``(N,)`` integers of a pointer's size, to work in.
-            work: ``(N,)`` to work in.
-            out: ``(N,)``.
+        All others are to work in; ``index`` holds integers of a pointer's size.
         """
         np.multiply(squared, self.per_unit, out=place)
         np.floor(place, out=work)
