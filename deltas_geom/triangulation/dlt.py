@@ -37,15 +37,10 @@ def rows(proj: Numbers, pixels: Numbers) -> Numbers:
 def normal_matrix(
     coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor | None = None
 ) -> tuple[Tensor, ...]:
-    """A^T A, the upper triangle row by row.
+    """A^T A, the upper triangle row by row: D (D + 1) / 2 entries ``(*B, N)``.
 
-    Args:
-        coefficients: of the cameras, see :func:`normal_coefficients`.
-        x, y: ``(*B, V, N)`` px.
-        squared: ``(*B, V, N)`` squared weights; None where the coefficients hold them.
-
-    Returns:
-        D (D + 1) / 2 entries ``(*B, N)``.
+    Of :func:`normal_coefficients`, pixels and squared weights ``(*B, V, N)`` each; None where the
+    coefficients hold the weights.
     """
     if plain(coefficients, x, y, squared):
         return product(coefficients, _terms_at_hand(x, y, squared)).unbind(dim=-2)

@@ -19,7 +19,6 @@ def within_residual(found: _R, max_residual: float) -> _R:
     view is wrong.
 
     Args:
-        found: points with a residual.
         max_residual: px, or rad after :func:`deltas_geom.triangulate_rays` and its kin.
 
     Raises:

@@ -59,11 +59,8 @@ def table_of(
 ) -> Table | None:
     """The table of a function of a squared radius, or None where it has no piece to be read.
 
-    Args:
-        function: from squared radii ``(N,)``, positive and ascending, values and whether there is
-            one; what has none comes after what has.
-        end: of the squared radii.
-        tolerance: of what is read, relative.
+    From squared radii ``(N,)``, positive and ascending, it gives values and whether there is one;
+    what has none comes after what has. The tolerance is relative.
     """
     places, to_series, to_pieces = _matrices()
     squared = ((np.arange(_PANELS)[:, None] + places) * (end / _PANELS)).ravel()
