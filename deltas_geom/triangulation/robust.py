@@ -186,7 +186,7 @@ def _consensus(
     known: KnownCameras, threshold: float, min_inliers: int, max_pairs: int, *tensors: Any
 ) -> tuple[Tensor, Tensor]:
     """Inliers ``(*B, V, N)``, and where there are none the status that says why ``(*B, N)``."""
-    observed, limit = _Observations(*tensors), threshold**2
+    observed, limit = _Observations(*tensors), threshold * threshold
 
     def solved(used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The point of these views as a candidate ``(*B, 3, 1, N)``, is it valid, its status."""

@@ -17,6 +17,9 @@ def robust_loss(loss: Loss, scale: float, squared: Tensor) -> tuple[Tensor, Tens
     """rho of squared distances s, px^2 (near 0 it is s), its influence rho', and 2 rho''."""
     if loss == "squared":
         return squared, squared.new_ones(()), squared.new_zeros(())
+    # Beyond, where nothing is far, or everything, squares would leave the range of numbers.
+    most = torch.finfo(squared.dtype).max ** 0.125
+    scale = min(max(scale, 1 / most), most)
     ratio = squared / scale**2
     if loss == "cauchy":
         slope = 1 / (1 + ratio)
