@@ -9,6 +9,7 @@ from torch import Tensor
 
 _NUMBERS = {str(number): number for number in range(1000)}
 _MASKS = ("mask", "used")
+_WHOLE = int | np.integer | torch.SymInt | Tensor
 _OPTIONAL = ("mask", "weights", "pose_covariance")
 
 
@@ -178,8 +179,8 @@ def check_counts(least: int, **counts: int | tuple[int, ...]) -> None:
     """Raise unless every count, or every one of a tuple, is a whole number of ``least`` or more."""
     for name, count in counts.items():
         each = count if isinstance(count, tuple) else (count,)
-        # In a trace sizes are tensors.
-        if not all(isinstance(number, int | np.integer | Tensor) for number in each):
+        # Traces have tensors and symbols for sizes.
+        if not all(isinstance(number, _WHOLE) for number in each):
             raise TypeError(f"{name} must be whole, got {count!r}")
         if any(number < least for number in each):
             raise ValueError(f"{name} must be {least} or more, got {count}")
