@@ -2,6 +2,7 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
 from deltas_nets.errors import UserError
@@ -53,7 +54,8 @@ def usable_device(device: "str | torch.device") -> str:
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+        # Torch lists all devices that it has heard of.
+        reason = shorten(str(error).splitlines()[0], 80, placeholder=" ...")
         raise UserError(
             f"cannot compute there ({reason})", f"--device {device}", "use cpu"
         ) from None
