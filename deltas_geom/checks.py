@@ -1,6 +1,7 @@
 """What arguments must be, in the words of every error."""
 
 from collections.abc import Sized
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,6 +9,8 @@ from torch import Tensor
 
 _NUMBERS = {str(number): number for number in range(1000)}
 _MASKS = ("mask", "used")
+_WHOLE = int | np.integer | torch.SymInt | Tensor
+_OPTIONAL = ("mask", "weights", "pose_covariance")
 
 
 class ShapeError(ValueError):
@@ -114,12 +117,20 @@ def check_bool(**named: Tensor | None) -> None:
             raise TypeError(f"{name} must be bool, True = used, got {mask.dtype}: {cure}")
 
 
+def check_given(**named: tuple[Tensor | None, str]) -> dict[str, tuple[Tensor, str]]:
+    """Raise as :func:`check_shapes`, and leave out what need not be given, and is None."""
+    given: dict[str, Any] = {
+        name: one for name, one in named.items() if one[0] is not None or name not in _OPTIONAL
+    }
+    check_shapes(**given)
+    return given
+
+
 def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:
-    """The batch dims to which all tensors broadcast, None being left out; raise as check_shapes.
+    """The batch dims to which all tensors of :func:`check_given` broadcast.
 
     Raises:
-        ShapeError: as :func:`check_shapes`, or batch dims do not broadcast.
-        TypeError: as :func:`check_shapes`.
+        ShapeError, TypeError: as :func:`check_shapes`, or batch dims do not broadcast.
 
     Example:
         >>> import torch
@@ -127,8 +138,7 @@ def check_batch(**named: tuple[Tensor | None, str]) -> torch.Size:
         >>> check_batch(proj=(cameras, "V 3 4"), pixels=(pixels, "V N 2"), mask=(None, "V N"))
         torch.Size([5, 3])
     """
-    given = {name: (tensor, spec) for name, (tensor, spec) in named.items() if tensor is not None}
-    check_shapes(**given)
+    given = check_given(**named)
     # Of "+V 3 4" there are as many dims as words.
     return batch_shape(*(x.shape[: x.ndim - len(spec.split())] for x, spec in given.values()))
 
@@ -163,6 +173,17 @@ def check_positive(**named: float) -> None:
     for name, value in named.items():
         if not value > 0:
             raise ValueError(f"{name} must be positive, got {value}")
+
+
+def check_counts(least: int, **counts: int | tuple[int, ...]) -> None:
+    """Raise unless every count, or every one of a tuple, is a whole number of ``least`` or more."""
+    for name, count in counts.items():
+        each = count if isinstance(count, tuple) else (count,)
+        # Traces have tensors and symbols for sizes.
+        if not all(isinstance(number, _WHOLE) for number in each):
+            raise TypeError(f"{name} must be whole, got {count!r}")
+        if any(number < least for number in each):
+            raise ValueError(f"{name} must be {least} or more, got {count}")
 
 
 def check_depth_range(depth_range: tuple[float, float]) -> None:

@@ -6,9 +6,10 @@ from typing import ClassVar, Literal
 from torch import Tensor, nn
 
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.epipolar.sampling import Samples, sample_segments
+from deltas_geom.checks import check_depth_range
+from deltas_geom.epipolar.sampling import Samples, check_spread, sample_segments
 from deltas_geom.epipolar.segments import epipolar_segments
-from deltas_geom.rasterize import SparseDepth, rasterize_depth
+from deltas_geom.rasterize import SparseDepth, check_drawing, rasterize_depth
 from deltas_geom.triangulation.equations import check_settings
 from deltas_geom.triangulation.prepared import PreparedTriangulator
 from deltas_geom.triangulation.results import Triangulation
@@ -38,6 +39,8 @@ class EpipolarSampler(_Fixed):
         offsets: Sequence[float] = (),
     ) -> None:
         super().__init__()
+        check_spread(num_samples, spacing, offsets)
+        check_depth_range(depth_range)
         self.num_samples = num_samples
         self.depth_range = depth_range
         self.spacing = spacing
@@ -99,6 +102,7 @@ class DepthRasterizer(_Fixed):
         splat: Literal["pixel", "bilinear"] = "pixel",
     ) -> None:
         super().__init__()
+        check_drawing(reduce, splat)
         self.reduce = reduce
         self.splat = splat
 

@@ -23,6 +23,14 @@ class SparseDepth(Record):
     weight: Tensor
 
 
+def check_drawing(reduce: str, splat: str) -> None:
+    """Raise ``ValueError`` unless both are known to :func:`rasterize_depth`."""
+    if reduce not in ("front", "mean"):
+        raise ValueError(f"reduce must be 'front' or 'mean', got {reduce!r}")
+    if splat not in ("pixel", "bilinear"):
+        raise ValueError(f"splat must be 'pixel' or 'bilinear', got {splat!r}")
+
+
 @without_autocast
 def rasterize_depth(
     pixels: Tensor,
@@ -65,6 +73,7 @@ def rasterize_depth(
         ... ).depth
         tensor([[[2., 0.]]])
     """
+    check_drawing(reduce, splat)
     check_image_size(image_size)
     batch = check_batch(
         pixels=(pixels, "N 2"), depth=(depth, "N"), mask=(mask, "N"), weights=(weights, "N")
@@ -86,8 +95,6 @@ def rasterize_depth(
     depth = depth[..., None].expand(shares.shape).flatten(-2)
     index = (rows.clamp(0, height - 1) * width + columns.clamp(0, width - 1)).flatten(-2)
     flat = _front if reduce == "front" else _mean
-    if reduce not in ("front", "mean"):
-        raise ValueError(f"reduce must be 'front' or 'mean', got {reduce!r}")
     image_depth, image_weight = flat(index, depth, weight, height * width)
     shape = (*batch, 1, height, width)
     return SparseDepth(image_depth.reshape(shape), image_weight.reshape(shape))
@@ -99,8 +106,6 @@ def _footprint(pixels: Tensor, splat: str) -> tuple[Tensor, Tensor, Tensor]:
         # floor(x + 0.5), not round: a pixel owns [-0.5, 0.5) around its centre.
         cell = (pixels + 0.5).floor().long()
         return torch.ones_like(pixels[..., :1]), cell[..., :1], cell[..., 1:]
-    if splat != "bilinear":
-        raise ValueError(f"splat must be 'pixel' or 'bilinear', got {splat!r}")
     corner = pixels.floor()
     x, y = (pixels - corner).unbind(dim=-1)
     shares = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=-1)

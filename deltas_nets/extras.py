@@ -1,11 +1,16 @@
-"""Packages that not everybody needs: whether they are there, asked before any work is done."""
+"""Packages and devices that not everybody has: whether they are there, asked before all work."""
 
 from importlib.util import find_spec
 from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING
 
 from deltas_nets.errors import UserError
 
-__all__ = ["check_extra"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["check_extra", "usable_device"]
 
 
 def check_extra(
@@ -34,3 +39,24 @@ def check_extra(
             remedy = f'pip install "deltas-depth[{extra}]"'
             remedy += f", or {otherwise}" if otherwise else ""
             raise UserError(f"{wanted_by} the package {package}", where, remedy)
+
+
+def usable_device(device: "str | torch.device") -> str:
+    """The name of a device, as of ``--device``; "auto" is a CUDA device where there is one.
+
+    Raises:
+        UserError: nothing can be computed there.
+    """
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        # Torch lists all devices that it has heard of.
+        reason = shorten(str(error).splitlines()[0], 80, placeholder=" ...")
+        raise UserError(
+            f"cannot compute there ({reason})", f"--device {device}", "use cpu"
+        ) from None
+    return str(device)

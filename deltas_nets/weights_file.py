@@ -16,6 +16,7 @@ from torch import Tensor
 from deltas_nets.config import NetworkConfig, from_dict, to_dict
 from deltas_nets.config.baselines import BASELINES
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.networks import Network, build_network
 from deltas_nets.network.torch_file import check_finite_weights
@@ -32,11 +33,11 @@ def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = 
 
     Args:
         name_or_file: a shipped network ("deltas-small"), or a weights file of `deltas train`.
-        device: where to put it.
+        device: where to put it; "auto" is a CUDA device where there is one.
 
     Raises:
-        UserError: no such network or file, or the file holds something else, such as a network
-            without points.
+        UserError: no such network, file or device, or the file holds something else, such as a
+            network without points.
 
     Example:
         >>> load_model().config.name
@@ -54,7 +55,7 @@ def load_model(name_or_file: str | Path = DEFAULT, device: str | torch.device = 
 
 def load_network(name_or_file: str | Path, device: str | torch.device = "cpu") -> Network:
     """A trained network of any kind that `deltas train` trains; arguments as of `load_model`."""
-    file = weights_file(name_or_file)
+    file, device = weights_file(name_or_file), usable_device(device)
     metadata = read_metadata(file)
     if "network" not in metadata:
         raise UserError("this file holds no deltas network", file, "name a file of deltas train")

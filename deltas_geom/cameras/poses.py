@@ -85,8 +85,14 @@ def is_rigid(b_from_a: Tensor, *, tolerance: float = 1e-3) -> Tensor:
         tolerance: largest deviation of an entry of R R^T from the identity. Poses written
             with six digits are within 1e-5; a scaled or sheared matrix is not within 1e-3.
             Rounding to half precision is tolerated, too.
+
+    Raises:
+        ShapeError: the trailing shape differs.
+        ValueError: the tolerance is negative.
     """
     check_shapes(b_from_a=(b_from_a, "4 4"))
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must not be negative, got {tolerance}")
     return _is_rigid(b_from_a, max(tolerance, 2 * torch.finfo(b_from_a.dtype).eps))
 
 

@@ -42,9 +42,7 @@ class Evidence(NamedTuple):
 def gather_evidence(pixels: Tensor, seen: Tensor) -> Evidence:
     """Pairs of views with the most matches, about five for each or more view.
 
-    Args:
-        pixels: ``(V, N, 2)`` float64, finite where seen.
-        seen: ``(V, N)`` bool.
+    Pixels are ``(V, N, 2)`` float64, finite where ``seen``.
     """
     pairs = choose_pairs(seen)
     both = seen[pairs[:, 0]] & seen[pairs[:, 1]]
@@ -85,17 +83,12 @@ def choose_pairs(seen: Tensor) -> Tensor:
 
 
 def residuals(evidence: Evidence, K: Tensor, pose: Tensor, *, share: float = SHARE) -> Tensor:
-    """Distance in px that a quarter of a pair's matches keep within, ``(*B, P)``.
+    """Distance ``(*B, P)`` px that a quarter of a pair's matches, or a ``share``, keep within.
 
     A match is as far off as its pixel in one view is from what that view sees of the other
     pixel's ray: a half line, from the ray's far end to the epipole. So a point behind a camera
-    is off by its parallax, and without a baseline there is a single right place.
-
-    Args:
-        evidence: of P pairs.
-        K: ``(*B, V, 3, 3)`` any invertible matrices, as they may be transposed.
-        pose: ``(*B, V, 4, 4)`` cam_from_world.
-        share: of a pair's matches must be within the distance.
+    is off by its parallax, and without a baseline there is a single right place. K may be any
+    invertible matrices ``(*B, V, 3, 3)``, as they may be transposed; poses are cam_from_world.
     """
     off = _squared(evidence, K, pose)
     rank = ((evidence.counts * share).ceil().long() - 1).clamp(min=0)

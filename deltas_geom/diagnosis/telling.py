@@ -33,16 +33,7 @@ _MOVING = "{cause}: all cameras stand in one place, yet matches move against it"
 
 
 class Told(NamedTuple):
-    """What is known before there is a cause.
-
-    Attributes:
-        views: as given.
-        pixels: as given.
-        seen: ``(V, N)`` bool.
-        given: as given, tried.
-        cameras: ``(V)`` px.
-        ranking: all that was tried.
-    """
+    """What is known before there is a cause; the residuals of ``cameras`` ``(V)`` in px."""
 
     views: PosedViews
     pixels: Tensor

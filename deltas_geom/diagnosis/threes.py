@@ -21,15 +21,8 @@ def off_in_threes(
 ) -> Tensor:
     """How far off the cameras are whose pixels hardly ever fit a point of two other views.
 
-    Args:
-        K: ``(V, 3, 3)``.
-        pose: ``(V, 4, 4)`` cam_from_world.
-        pixels: ``(V, N, 2)`` float64, finite where seen.
-        seen: ``(V, N)`` bool.
-        threshold: px, within which a pixel fits.
-
-    Returns:
-        ``(V)`` px, the median of what does not fit; 0 for all other cameras.
+    ``(V)`` px, the median of what is off by more than ``threshold``; 0 for all other cameras.
+    Pixels are ``(V, N, 2)`` float64, finite where ``seen``.
     """
     points = (seen.sum(dim=0) >= 3).nonzero().squeeze(-1)
     if not len(points):

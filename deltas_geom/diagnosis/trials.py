@@ -87,13 +87,9 @@ def _told_apart(hypotheses: Iterator[Hypothesis]) -> Iterator[Hypothesis]:
 
 
 def explains(given: Trial, trial: Trial, threshold: float, *, on: Tensor | None = None) -> bool:
-    """Whether so much less is left that it is no accident.
+    """Whether a trial leaves so much less than what was given that it is no accident.
 
-    Args:
-        given: as given.
-        trial: to be judged.
-        threshold: px.
-        on: ``(P)`` bool, the pairs that count; those that the trial concerns unless given.
+    On the pairs ``(P)`` that it concerns, or on others.
     """
     on = trial.concerned if on is None else on
     # All matches of some of many pairs may be wrong; of one camera's few pairs all count.

@@ -1,5 +1,6 @@
 """Places along epipolar segments, and feature maps read at pixels."""
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -9,7 +10,7 @@ from torch import Tensor
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.pixels import in_image, read_map
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_batch, check_kind, check_shapes
+from deltas_geom.checks import batch_shape, check_batch, check_counts, check_kind, check_shapes
 from deltas_geom.epipolar.segments import Segments, epipolar_rays
 from deltas_geom.numerics.arithmetic import (
     at_least_in_single,
@@ -53,6 +54,15 @@ def check_scores(keypoints: Tensor, scores: Tensor, samples: Samples, dims: str)
     )
 
 
+def check_spread(num_samples: int, spacing: str, offsets: Sequence[float]) -> None:
+    """Raise as :func:`sample_segments` where a setting makes no sense."""
+    check_counts(2, num_samples=num_samples)
+    if spacing not in ("inv_depth", "pixels"):
+        raise ValueError(f"spacing must be 'inv_depth' or 'pixels', got {spacing!r}")
+    if not all(map(math.isfinite, offsets)):
+        raise ValueError(f"offsets must be finite, got {offsets}")
+
+
 @without_autocast
 def sample_segments(
     segments: Segments,
@@ -76,10 +86,14 @@ def sample_segments(
         Samples. Those of a segment that is not visible, not finite, or without a foreshortening
         above 0, are masked.
 
+    Raises:
+        ShapeError: a trailing shape differs.
+        TypeError: no segments, or a number of samples that is not whole.
+        ValueError: fewer than 2 samples, unknown spacing, an offset that is not finite.
+
     Source: the paper, section 3.2.
     """
-    if num_samples < 2:
-        raise ValueError(f"num_samples must be at least 2, got {num_samples}")
+    check_spread(num_samples, spacing, offsets)
     check_kind("segments", segments, Segments, "epipolar_segments(...)")
     check_shapes(
         start=(segments.start, "S N 2"),
@@ -107,10 +121,8 @@ def sample_segments(
     if spacing == "inv_depth":
         of_depth, nearer = fraction, fraction * ratio
         of_pixels = nearer / (rest + nearer)
-    elif spacing == "pixels":
-        of_depth, of_pixels = fraction / (ratio * rest + fraction), fraction
     else:
-        raise ValueError(f"spacing must be 'inv_depth' or 'pixels', got {spacing!r}")
+        of_depth, of_pixels = fraction / (ratio * rest + fraction), fraction
     along = end - start
     # Not a product and a sum, which take five times as long where there are many samples.
     inv_depth = torch.addcmul(low, of_depth, high - low)

@@ -134,13 +134,8 @@ def correlate_normalized(
 def _in_pieces(
     function: Callable[..., Tensor], maps: Tensor, *keypoints: Tensor, elements: int
 ) -> Tensor:
-    """``function(maps, *keypoints)`` by views and chunks of keypoints.
-
-    Args:
-        function: from ``(*B, C, h, w)`` and ``(*B, n, ...)`` to ``(*B, n, O, S)``.
-        maps: ``(*B, C, h, w)``.
-        *keypoints: ``(*B, N, ...)``.
-        elements: that the function holds per keypoint of one view.
+    """``function(maps, *keypoints)`` of ``(*B, C, h, w)`` and ``(*B, N, ...)``, ``(*B, N, O, S)``,
+    by views and chunks of keypoints, for each of which it holds so many elements.
     """
     if torch.compiler.is_compiling():  # pieces would fix the number of keypoints
         return function(maps, *keypoints)

@@ -10,7 +10,14 @@ from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_divide
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import batch_shape, check_batch, check_bool, check_positive, check_shapes
+from deltas_geom.checks import (
+    batch_shape,
+    check_batch,
+    check_bool,
+    check_counts,
+    check_positive,
+    check_shapes,
+)
 from deltas_geom.epipolar.sampling import Samples, check_scores, sample_inv_depths
 from deltas_geom.numerics.arithmetic import (
     both,
@@ -92,8 +99,8 @@ def soft_argmax(
         tensor([2.])
     """
     batch = check_batch(logits=(logits, "+S"), positions=(positions, "S D"), mask=(mask, "S"))
-    if window is not None and window < 0:
-        raise ValueError(f"window must not be negative, got {window}")
+    if window is not None:
+        check_counts(0, window=window)
     # Beyond, squares of what is not possible count.
     positions, known = finite_or_zero(positions, limit=torch.finfo(positions.dtype).max ** 0.25)
     logits, finite = finite_or_zero(logits.expand(*batch, -1), dims=0)
@@ -270,16 +277,7 @@ def matches_at(
     weights: Tensor,
     image_size: tuple[int, int],
 ) -> Matches:
-    """The matches that one inverse depth per keypoint implies.
-
-    Args:
-        views: the anchor (view 0) and its V-1 sources.
-        keypoints: ``(*B, N, 2)``.
-        inv_depth: ``(*B, N)`` 1/m.
-        variance: ``(*B, N)`` of the inverse depth, 1/m^2.
-        weights: ``(*B, N)``.
-        image_size: (height, width) of the sources.
-    """
+    """The matches that one inverse depth per keypoint implies; its variance in 1/m^2."""
     at = torch.stack([inv_depth, inv_depth + variance.clamp_min(0).sqrt().detach()], dim=-1)
     places = sample_inv_depths(views, keypoints, at, image_size=image_size)
     pixels, beside = places.pixels.squeeze(-3).unbind(dim=-2)

@@ -28,14 +28,7 @@ def promoted(*tensors: Tensor) -> tuple[Tensor, ...]:
 
 
 def at_least_single(tensor: Tensor) -> Tensor:
-    """In float32 if it is of half precision, otherwise as it is.
-
-    Example:
-        >>> at_least_single(torch.ones(1, dtype=torch.bfloat16)).dtype
-        torch.float32
-        >>> at_least_single(torch.ones(1, dtype=torch.float64)).dtype
-        torch.float64
-    """
+    """In float32 if it is of half precision, otherwise as it is."""
     return in_dtype(tensor, torch.promote_types(tensor.dtype, torch.float32))
 
 

@@ -61,12 +61,7 @@ class Pivots(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """LDL^T, to solve with.
-
-    Attributes:
-        pivots: LDL^T.
-        scales: the last pivot by each of the others.
-    """
+    """LDL^T, and to solve with it the last pivot by each of the others."""
 
     pivots: Pivots
     scales: Vector3

@@ -161,14 +161,8 @@ def _nearer(
     larger one; in the plane of both (Rayleigh-Ritz) the smaller one is found. Vectors the squared
     sine of whose angle is lost in rounding count as one.
 
-    Args:
-        matrix: M.
-        a: unit vector near the one looked for.
-        quotient: a^T M a.
-        noise: rounding of an eigenvalue.
-
-    Returns:
-        The vector, of any length, and its quotient.
+    From a unit vector and its quotient a^T M a to a vector of any length and its quotient;
+    ``noise`` is the rounding of an eigenvalue.
     """
     # Off the quotient itself, where a pivot of a simple matrix may vanish exactly.
     below = -0.4 * noise
@@ -203,12 +197,8 @@ def _polished(factors: Factors, x: Vector4, product: Callable[[Vector4], Vector4
 def rayleigh_step(matrix: Symmetric4, x: Vector4) -> Vector4:
     """x - (M - mu)^+ (M x), mu = x^T M x: the null vector with its derivatives, and the value x.
 
-    Args:
-        matrix: positive semidefinite, finite.
-        x: its null vector, of unit length and without gradient.
-
-    Returns:
-        Where M - mu is not definite in the complement of x, x without derivatives.
+    x has unit length and no gradient. Where M - mu is not definite in its complement, there are no
+    derivatives.
     """
     image = multiply(matrix, x)
     # M x is mu x but for rounding, which the derivative of the inverse would multiply: by 1e9 where

@@ -1,27 +1,8 @@
-"""What a scene can be asked for: counts and bounds, in the words of every error."""
+"""What a scene can be asked for: places and bounds, in the words of every error."""
 
 import math
 
-
-def check_counts(least: int, **counts: int | tuple[int, ...]) -> None:
-    """Raise unless every count, or every one of a tuple, is a whole number of ``least`` or more.
-
-    Raises:
-        TypeError: not a whole number.
-        ValueError: too small.
-
-    Example:
-        >>> check_counts(2, num_views=1)
-        Traceback (most recent call last):
-        ...
-        ValueError: num_views must be 2 or more, got 1
-    """
-    for name, count in counts.items():
-        each = count if isinstance(count, tuple) else (count,)
-        if not all(isinstance(number, int) for number in each):
-            raise TypeError(f"{name} must be whole, got {count!r}")
-        if any(number < least for number in each):
-            raise ValueError(f"{name} must be {least} or more, got {count}")
+from deltas_geom.checks import check_counts
 
 
 def check_places(size: tuple[int, int]) -> None:

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import check_image_size
-from deltas_geom.testing.arguments import check_bounds, check_counts, check_places
+from deltas_geom.checks import check_counts, check_image_size
+from deltas_geom.testing.arguments import check_bounds, check_places
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.registry import Invariant
 from deltas_geom.testing.scenes import (

@@ -17,8 +17,8 @@ except ImportError as error:  # pragma: no cover
 
 from deltas_geom.cameras.projection import unproject
 from deltas_geom.cameras.views import PosedViews
-from deltas_geom.checks import check_image_size
-from deltas_geom.testing.arguments import check_bounds, check_counts, check_places
+from deltas_geom.checks import check_counts, check_image_size
+from deltas_geom.testing.arguments import check_bounds, check_places
 from deltas_geom.testing.planar import DepthScene, MapScene, ScoreScene
 from deltas_geom.testing.scenes import IMAGE_SIZE, PosedScene, rigid, scene_from
 from deltas_geom.testing.target import DepthRange

@@ -34,18 +34,12 @@ def gradients_of(
 ) -> tuple[Tensor | None, Tensor, Tensor | None]:
     """Of the sum of gradient * points, to first order, by what the equations were made of.
 
-    Args:
-        equations: of N points.
-        vector: their null vectors in the frame; anything where not valid.
-        valid: ``(*B, N)`` bool.
-        gradient: three ``(*B, N)`` by the points.
-        weights: ``(*B, V, N)`` as they were given; None if they need no gradient.
-        of_cameras: are those by the cameras wanted, too?
-        dtype: of the pixels.
+    The vectors are null vectors in the frame, anything where not valid; weights None if they need
+    no gradient.
 
     Returns:
-        ``(*B, V, 3, 4)`` or None, ``(*B, V, N, 2)``, ``(*B, V, N)`` or None; broadcast as the
-        inputs were.
+        ``(*B, V, 3, 4)`` or None, ``(*B, V, N, 2)`` in the dtype of pixels, ``(*B, V, N)`` or None;
+        broadcast as the inputs were.
     """
     place, push, framed = _pulled(equations, vector, valid, gradient)
     rig, (x, y, known) = equations.rig, equations.observed

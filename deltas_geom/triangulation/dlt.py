@@ -28,9 +28,7 @@ from deltas_geom.numerics.vectors import Numbers
 def rows(proj: Numbers, pixels: Numbers) -> Numbers:
     """A without weights: the equations ``(*B, N, V, 2, 4)`` of N points, two of each view.
 
-    Args:
-        proj: ``(*B, N, V, 3, 4)`` rows p1, p2, p3; tensor or array.
-        pixels: ``(*B, N, V, 2)``, likewise.
+    Of cameras ``(*B, N, V, 3, 4)`` and pixels ``(*B, N, V, 2)``, tensors or arrays.
     """
     equations: Numbers = pixels[..., None] * proj[..., 2:, :] - proj[..., :2, :]
     return equations
@@ -39,15 +37,10 @@ def rows(proj: Numbers, pixels: Numbers) -> Numbers:
 def normal_matrix(
     coefficients: Tensor, x: Tensor, y: Tensor, squared: Tensor | None = None
 ) -> tuple[Tensor, ...]:
-    """A^T A, the upper triangle row by row.
+    """A^T A, the upper triangle row by row: D (D + 1) / 2 entries ``(*B, N)``.
 
-    Args:
-        coefficients: of the cameras, see :func:`normal_coefficients`.
-        x, y: ``(*B, V, N)`` px.
-        squared: ``(*B, V, N)`` squared weights; None where the coefficients hold them.
-
-    Returns:
-        D (D + 1) / 2 entries ``(*B, N)``.
+    Of :func:`normal_coefficients`, pixels and squared weights ``(*B, V, N)`` each; None where the
+    coefficients hold the weights.
     """
     if plain(coefficients, x, y, squared):
         return product(coefficients, _terms_at_hand(x, y, squared)).unbind(dim=-2)

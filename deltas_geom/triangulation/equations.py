@@ -115,11 +115,8 @@ def rig_of(cameras: Cameras) -> Rig:
 
 
 class Alike(NamedTuple):
-    """The one frame of points that all views see and that all weigh the same.
-
-    Attributes:
-        frame: of one point.
-        coefficients: of the points' normal matrices in that frame.
+    """The one frame of points that all views see and that all weigh the same, and coefficients of
+    their normal matrices in it.
     """
 
     frame: RigFrame

@@ -24,12 +24,8 @@ from deltas_geom.triangulation.uncertainty import covariance_of, representable, 
 class LongWay:
     """Triangulation of pixels whose shapes have been checked.
 
-    Args:
-        rig: of the cameras.
-        batch: of all inputs together.
-        frame: in which points are solved.
-        dtype: of the results.
-        alike: are there neither weights nor a mask, so that all points share a frame?
+    All inputs have one ``batch``, results the dtype. Points are ``alike``, and share a frame, if
+    there are neither weights nor a mask.
     """
 
     def __init__(

@@ -29,14 +29,8 @@ def points_of_pairs(
     """Points ``(*B, 3, C, N)`` of pairs of views, and whether they exist ``(*B, C, N)``.
 
     Where the rays are closest to each other, the point between them at which both views are off
-    by about as many pixels.
-
-    Args:
-        lines: ``(*B, 6, V, N)`` centres of the cameras, then directions of rays of depth 1; 0 if
-            there is no centre.
-        first: ``(*B, C, N)`` index of a view.
-        second: likewise.
-        exist: ``(*B, C, N)`` bool.
+    by about as many pixels. Lines are ``(*B, 6, V, N)``: centres of the cameras, then directions of
+    rays of depth 1; 0 if there is no centre. All else is ``(*B, C, N)``.
     """
     views = torch.cat([first, second], dim=-2).unsqueeze(-3)
     # Not take_along_dim: for the sake of negative ones it divides each index.

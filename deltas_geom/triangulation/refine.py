@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from deltas_geom.cameras.homogeneous import safe_sqrt
-from deltas_geom.checks import check_positive
+from deltas_geom.checks import check_counts, check_positive
 from deltas_geom.numerics.arithmetic import outside_gradients, without_autocast, without_gradients
 from deltas_geom.numerics.chunks import cut_points
 from deltas_geom.numerics.evaluation import recomputed
@@ -119,8 +119,7 @@ def refine_points(
         raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy', got {loss!r}")
     if gradient not in ("unrolled", "implicit"):
         raise ValueError(f"gradient must be 'unrolled' or 'implicit', got {gradient!r}")
-    if steps < 0:
-        raise ValueError(f"steps must not be negative, got {steps}")
+    check_counts(0, steps=steps)
     check_positive(scale=scale)
 
     def refined(descend: _Descent, *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -67,12 +67,8 @@ def mean_of(errors: Tensor, seen: Tensor, squared: Tensor) -> Tensor:
 
 @without_gradients
 def parallax_of(centers: Tensor, points: Vector3, used: Tensor) -> Tensor:
-    """Largest angle ``(*B, N)`` rad between rays from ``(*B, V, 3)`` to the points.
-
-    Args:
-        centers: of the cameras.
-        points: three ``(*B, N)`` in the same frame.
-        used: ``(*B, V, N)`` 1 or 0.
+    """Largest angle ``(*B, N)`` rad between used rays from ``(*B, V, 3)`` to the points, in one
+    frame; ``used`` is 1 or 0.
     """
     x, y, z = (
         component.unsqueeze(-2) - center[..., None]

@@ -19,7 +19,6 @@ def within_residual(found: _R, max_residual: float) -> _R:
     view is wrong.
 
     Args:
-        found: points with a residual.
         max_residual: px, or rad after :func:`deltas_geom.triangulate_rays` and its kin.
 
     Raises:
@@ -39,12 +38,9 @@ def beyond(depth: Tensor, depth_range: tuple[float, float]) -> Tensor:
 
 
 def without(found: _R, outside: Tensor, reason: Status) -> _R:
-    """Any record of points with those of ``(*B, N)`` that were valid failed for a reason.
+    """Any record of points with those ``outside`` that were valid failed for a reason.
 
-    Args:
-        found: its fields are 0 there from now on, but for ``pixels``, which lose their gradient.
-        outside: bool, the points to refuse.
-        reason: why.
+    All its fields are 0 there, but for ``pixels``, which lose their gradient.
     """
     known = found._asdict()
     outside, point = known["valid"] & outside, known.get("point_index")

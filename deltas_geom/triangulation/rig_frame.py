@@ -113,13 +113,9 @@ def stand_apart(
 ) -> tuple[Numbers, Numbers]:
     """Whether the cameras of each point are two or more and stand apart, and the former alone.
 
-    Args:
-        count: ``(*B, N)`` of used cameras.
-        reach: ``(*B, N)`` squared spread of their centres.
-        size: ``(*B, N)`` mean squared distance of the centres from the datum.
-        from_world: ``(*B, N)`` the same from the world's origin.
-        eps: rounding of the inputs, relative.
-        own: rounding of these sums, relative.
+    By their count, the squared spread of their centres, and the mean squared distance of these from
+    the datum and from the world's origin, ``(*B, N)`` each; ``eps`` is the relative rounding of the
+    inputs, ``own`` that of these sums.
     """
     enough = count >= 2
     # Centres closer together than the rounding of where they are do not differ.

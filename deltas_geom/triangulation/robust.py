@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import check_positive
+from deltas_geom.checks import check_counts, check_positive
 from deltas_geom.numerics.arithmetic import (
     both,
     only,
@@ -97,10 +97,8 @@ def triangulate_robust(
     """
     batch = check_observed(proj=proj, pixels=pixels, weights=weights, mask=mask)
     check_positive(threshold=threshold)
-    if min_inliers < 2:
-        raise ValueError(f"min_inliers must be 2 or more, got {min_inliers}")
-    if max_pairs < 1:
-        raise ValueError(f"max_pairs must be 1 or more, got {max_pairs}")
+    check_counts(2, min_inliers=min_inliers)
+    check_counts(1, max_pairs=max_pairs)
 
     with outside_gradients():
         known = KnownCameras(proj)
@@ -172,12 +170,7 @@ def _observe(
 
 
 class _Best(NamedTuple):
-    """The best candidates.
-
-    Attributes:
-        inliers: ``(*B, V, N)`` bool.
-        cost: ``(*B, N)`` px^2, infinite where there is none.
-    """
+    """The best candidates: ``(*B, V, N)`` bool and ``(*B, N)`` px^2, infinite of none."""
 
     inliers: Tensor
     cost: Tensor
@@ -193,7 +186,7 @@ def _consensus(
     known: KnownCameras, threshold: float, min_inliers: int, max_pairs: int, *tensors: Any
 ) -> tuple[Tensor, Tensor]:
     """Inliers ``(*B, V, N)``, and where there are none the status that says why ``(*B, N)``."""
-    observed, limit = _Observations(*tensors), threshold**2
+    observed, limit = _Observations(*tensors), threshold * threshold
 
     def solved(used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The point of these views as a candidate ``(*B, 3, 1, N)``, is it valid, its status."""

@@ -17,6 +17,9 @@ def robust_loss(loss: Loss, scale: float, squared: Tensor) -> tuple[Tensor, Tens
     """rho of squared distances s, px^2 (near 0 it is s), its influence rho', and 2 rho''."""
     if loss == "squared":
         return squared, squared.new_ones(()), squared.new_zeros(())
+    # Beyond, where nothing is far, or everything, squares would leave the range of numbers.
+    most = torch.finfo(squared.dtype).max ** 0.125
+    scale = min(max(scale, 1 / most), most)
     ratio = squared / scale**2
     if loss == "cauchy":
         slope = 1 / (1 + ratio)
@@ -37,14 +40,8 @@ def second_derivative(
 ) -> Symmetric3:
     """Second derivative by points of half the sum of w^2 rho(e^2), e the reprojection errors.
 
-    Args:
-        normal: J^T W^2 J with the weights w^2 rho', six ``(*B, N)``.
-        proj: ``(*B, V, 3, 4)``.
-        place: x and y ``(*B, V, N)`` px of the projected points.
-        offset: x and y ``(*B, V, N)`` px of the errors.
-        inverse: ``(*B, V, N)`` 1 / depth.
-        influence: ``(*B, V, N)`` w^2 rho'.
-        bend: ``(*B, V, N)`` 2 w^2 rho''.
+    From J^T W^2 J with the weights w^2 rho' and, each ``(*B, V, N)``: x and y of the projected
+    points and of the errors, 1 / depth, w^2 rho' and 2 w^2 rho''.
     """
     (x, y), (dx, dy) = place, offset
     p1, p2, p3 = proj[..., :3].unsqueeze(-2).unbind(dim=-3)  # (*B, V, 1, 3)

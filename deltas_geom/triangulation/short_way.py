@@ -13,13 +13,7 @@ from deltas_geom.triangulation.uncertainty import covariance_of, representable, 
 
 
 class ShortWay:
-    """Triangulation of few pixels whose shapes have been checked.
-
-    Args:
-        rig: of the cameras.
-        frame: in which points are solved.
-        dtype: of the results, float32 or float64.
-    """
+    """Triangulation of few pixels whose shapes have been checked; float32 or float64."""
 
     def __init__(self, rig: ShortRig, frame: Frame, dtype: torch.dtype) -> None:
         self.rig, self.fixed = rig, frame == "world"

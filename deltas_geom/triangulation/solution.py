@@ -116,11 +116,7 @@ def of_trace_one(normal: Symmetric4, valid: Tensor) -> tuple[Symmetric4, Tensor]
 def _derivable(matrix: Symmetric4, vector: Vector4, valid: Tensor, frame: RigFrame) -> Vector4:
     """The null vector, of about unit length, as a function of the matrix and of the frame.
 
-    Args:
-        matrix: of :func:`of_trace_one`.
-        vector: its null vector, of any length; anything where not valid.
-        valid: ``(*B, N)`` bool.
-        frame: of the points, differentiable.
+    The matrix is of :func:`of_trace_one`; the vector has any length, and is any where not valid.
     """
     start = of_length_one(vector, valid)
     x0, x1, x2, x3 = rayleigh_step(_measured(matrix, start, valid, frame), start)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deltas_geom.checks import ShapeError, check_shapes
+from deltas_geom.checks import ShapeError, check_counts, check_given
 
 _OBSERVATIONS = 2**14  # at a time, padding included: what lies between stays in the cache
 _DIMS = {
@@ -54,15 +54,13 @@ def check_tracks(
     """
     indices = {"camera_index": camera_index, "point_index": point_index}
     named = {"proj": proj, **others, **indices, "weights": weights}
-    lists = {name: (x, _DIMS[name]) for name, x in named.items() if x is not None}
-    check_shapes(**lists)
+    lists = check_given(**{name: (x, _DIMS[name]) for name, x in named.items()})
     # A list has no batch: cameras and points of all scenes may share one list instead.
     for name, (tensor, dims) in lists.items():
         if tensor.dim() != len(dims.split()):
             wanted = f"({', '.join(dims.split())})"
             raise ShapeError(f"{name} must have shape {wanted}, got {tuple(tensor.shape)}")
-    if num_points < 0:
-        raise ValueError(f"num_points must not be negative, got {num_points}")
+    check_counts(0, num_points=num_points)
 
 
 def check_range(

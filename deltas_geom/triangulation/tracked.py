@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from deltas_geom.checks import check_tensor
 from deltas_geom.numerics.arithmetic import at_least_in_single, outside_gradients, without_autocast
 from deltas_geom.triangulation.refine import Refined, refine_points
 from deltas_geom.triangulation.robust import triangulate_robust
@@ -183,6 +184,7 @@ def track_covariance(
 
     Source: as of :func:`point_covariance`.
     """
+    check_tensor(weights=weights)
     check_tracks(
         proj, camera_index, point_index, weights, points=points, pose_covariance=pose_covariance
     )

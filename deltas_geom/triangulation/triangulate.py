@@ -86,11 +86,7 @@ def triangulate(
 
 
 class KnownCameras:
-    """Cameras, and what depends on them alone: computed when it is first needed, and then kept.
-
-    Args:
-        proj: ``(*B, V, 3, 4)``, which stay as they are.
-    """
+    """Cameras ``(*B, V, 3, 4)``, and what depends on them alone, kept when it was first needed."""
 
     def __init__(self, proj: Tensor) -> None:
         self.proj = proj

@@ -186,7 +186,6 @@ def depth_variance(proj: Tensor, covariance: Tensor) -> Tensor:
         >>> depth_variance(torch.eye(3, 4)[None], torch.diag(torch.tensor([1.0, 2.0, 9.0]))[None])
         tensor([[9.]])
     """
-    check_tensor(covariance=covariance)  # None: it was not asked for
     check_observed(proj=proj, covariance=covariance)
     dtype = torch.promote_types(proj.dtype, covariance.dtype)
     (cameras, _), work = finite_cameras(proj), solver_dtype(proj)

@@ -153,13 +153,8 @@ def weigh_at_hand(
 ) -> Weighed:
     """As :func:`weigh`, in any order of axes, and which pixels are finite.
 
-    Args:
-        pixels: float64; those of unused views may hold anything.
-        weights: in the order of the pixels, without coordinates.
-        mask: likewise.
-        ones: the weights that stand for none.
-        coordinates: the axis of x and y.
-        views: the axis of views, without coordinates.
+    ``ones`` are the weights that stand for none. x and y are along the axis ``coordinates``; the
+    axis of views is counted without it.
     """
     finite = None
     if not (pixels.min() > -_FARTHEST and pixels.max() < _FARTHEST):  # NaN is not

@@ -6,14 +6,14 @@ from json import JSONDecodeError
 __all__ = ["slip_in_json"]
 
 _BY_SIGHT = (
-    (r"", r"(?://|/\*|#)", "a comment, which JSON does not know", "delete it"),
+    (r"", r"(?://|/\*|#)", "a comment, which JSON does not know", "delete the comment"),
     (r"", r"\s*\Z", "the file ends too early", "copy it again: the end is lost, or a bracket"),
     (r",\s*", r"[\]}]", "a comma before a closing bracket", "delete the comma"),
     (r"", r",\s*[\]}]", "a comma before a closing bracket", "delete the comma"),
-    (r"[,\[{]\s*", r",", "a comma with nothing before it", "delete it"),
+    (r"[,\[{]\s*", r",", "a comma with nothing before it", "delete the comma"),
     (r"", r"['\u2018-\u201f]", "quotes of another kind", 'write straight double quotes: "'),
     (r"", r"(?:True|False|None)\b", "a word of Python", "write true, false, or null"),
-    (r"", r"[-+]?(?i:nan|inf)", "something that is no number", "write null, or leave it out"),
+    (r"", r"[-+]?(?i:nan|inf)", "something that is no number", "write null, or leave the name out"),
     (r":\s*-?\d+,\s*", r"\d", "a decimal comma", "write 0.5, not 0,5"),
     (r"", r"[-+]?\.\d|\+\d", "a number that JSON does not know", "write 0.5, not .5 or +0.5"),
     (r"\d", r"\.", "a number that ends with its point", "write 1.0 or 1, not 1."),
@@ -24,14 +24,14 @@ _BY_SIGHT = (
 """What stands before the place, what stands there, what that is, and what to do."""
 _BY_MESSAGE = (
     ("Extra data", "something behind the end", "keep one list or one object in the file"),
-    ("Unterminated string", "a text whose closing quote is missing", "close it"),
+    ("Unterminated string", "a text whose closing quote is missing", "close the quote"),
     (
         "Invalid control",
         "a line break or a tab inside quotes",
         r"write \n or \t, or close the quote",
     ),
-    ("Expecting ',' delimiter", "a comma or a closing bracket is missing", "write it"),
-    ("Expecting ':' delimiter", "a colon is missing", "write it"),
+    ("Expecting ',' delimiter", "a comma or a closing bracket is missing", "put one there"),
+    ("Expecting ':' delimiter", "a colon is missing", "put one there"),
 )
 
 

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from deltas_geom.checks import check_kind
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.captures.new_folder import check_new
@@ -94,6 +95,7 @@ def save_capture(
         UserError: the format cannot hold the capture, a file is missing, or the folder cannot be
             written; nothing is left behind.
     """
+    check_kind("capture", capture, Capture, "open_capture(PATH)")
     out = Path(out)
     if to not in WRITERS:
         raise UserError(f"there is no format {to!r}", "--to", f"use {', '.join(WRITERS)}")

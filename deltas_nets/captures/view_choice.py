@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from deltas_geom.checks import check_kind
 from deltas_nets.captures.capture import Capture, FloatArray
 from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.ids import ids_in_words
@@ -91,6 +92,7 @@ def choose_views(
     Raises:
         UserError: as there.
     """
+    check_kind("capture", capture, Capture, "open_capture(PATH)")
     if num_views < 2:
         what = f"{num_views} views are too few"
         raise UserError(what, "--views", "use 2 or more: the anchor and a source")

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from deltas_geom.checks import check_kind
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
 from deltas_nets.check.depth_files import unreadable_depth
@@ -88,6 +89,8 @@ def check_capture(
         threads: that look at frames, each computing alone: frames are small.
         report: called while frames are matched.
     """
+    check_kind("capture", capture, Capture, "open_capture(PATH)")
+    check_kind("network", network, Deltas, "load_model(NAME)")
     start = time.monotonic()
     sizes = wrong_sizes(capture)
     readable = sizes[0].mend(capture) if sizes and sizes[0].mend is not None else capture

@@ -7,8 +7,9 @@ from typing import Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, usable_device
+from deltas_nets.commands.flags import Flag
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.terminal import counted, progress, table_console
 
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, opened, usable_device
+from deltas_nets.commands.flags import Flag, opened
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.terminal import progress, warn
 
 MOST_THREADS = 4

@@ -77,20 +77,21 @@ class Convert(Command):
 
         capture = opened(self.capture, self.intrinsics)
         unit = self._unit(capture)
+        told = [] if self.scale_from is None else [f"a unit of the capture is {unit:.4g} m"]
         holds_depth = self.to not in ("colmap", "colmap-bin")
         if self.depths is not None:
             from deltas_nets.fuse.seeds import seeds, with_maps
-            from deltas_nets.fuse.sources import Predicted, depth_source
+            from deltas_nets.fuse.sources import depth_source
 
             source = depth_source(capture, self.depths)
             source.check()
-            if isinstance(source, Predicted) and source.left_out is not None:
-                warn(source.left_out)
+            if source.doubt is not None:
+                warn(source.doubt)
             capture = with_maps(source.capture, self.depths)
             with progress("points", len(source.ids)) as report:
                 found = seeds(source, self.points or POINTS, report=report)
             capture = replace(capture, points=found)
-            print(f"{len(found.xyz)} points that two maps or more agree on")
+            told.append(f"{len(found.xyz)} points that two maps or more agree on")
         if unit is not None:
             # Maps may be in metres already; and what a sensor tells the unit by is.
             change = unit / capture.scaled_by
@@ -105,7 +106,8 @@ class Convert(Command):
             warn(f"frames that cannot be used are left out: {ids_in_words(capture.lost)}")
         frames = counted(len(capture.frames), "frame")
         read_as = f", read as {capture.layout}," if capture.layout else ""
-        print(f"{frames}{read_as} written to {self.out} as {self.to}")
+        # Only now: the reader of what is printed may have had enough.
+        print(*told, f"{frames}{read_as} written to {self.out} as {self.to}", sep="\n")
 
     def _unit(self, capture: "Capture") -> float | None:
         """Metres in a unit of the capture, if a flag says how to know."""
@@ -117,8 +119,5 @@ class Convert(Command):
 
         predictor, config = load_predictor("deltas-small"), PredictConfig()
         if str(self.scale_from) == "sensor":
-            unit = scale_by_sensor(predictor, capture, config)
-        else:
-            unit = scale_by_measurements(predictor, capture, config, self.scale_from)
-        print(f"a unit of the capture is {unit:.4g} m")
-        return unit
+            return scale_by_sensor(predictor, capture, config)
+        return scale_by_measurements(predictor, capture, config, self.scale_from)

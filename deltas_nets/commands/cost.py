@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import NETWORKS, Flag, Network, usable_device
+from deltas_nets.commands.flags import NETWORKS, Flag, Network
 from deltas_nets.config import CONFIGS
+from deltas_nets.extras import usable_device
 
 Measured = Literal[Network, "cost-volume", "reference"]
 

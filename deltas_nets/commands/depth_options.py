@@ -4,8 +4,9 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
-from deltas_nets.commands.flags import sensible, usable_device
+from deltas_nets.commands.flags import sensible
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.terminal import progress
 
 if TYPE_CHECKING:

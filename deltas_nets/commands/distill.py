@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, usable_device
+from deltas_nets.commands.flags import Flag
 from deltas_nets.config.distill import DistillConfig
+from deltas_nets.extras import usable_device
 from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import progress
 

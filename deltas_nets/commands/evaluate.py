@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 
 from deltas_nets.commands.evaluate_flags import warn_of, warn_of_maps, without_effect
-from deltas_nets.commands.flags import Flag, Prediction, usable_device
+from deltas_nets.commands.flags import Flag, Prediction
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.commands.values import at_least_one
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.terminal import counted, progress, table_console, warn
 
 if TYPE_CHECKING:
@@ -148,10 +149,8 @@ class Evaluate(Prediction):
 
         scorer = self._scorer(many=many)
         scores = evaluate_scenes(scenes, protocol, scorer, depth_range=self.range)
-        title = (
-            counted(len(scenes), "scene") if many else str((*self.captures, *scenes.values())[0])
-        )
-        return scores, title
+        one = str((*self.captures, *scenes.values())[0])
+        return scores, counted(len(scenes), "scene") if many else one
 
     def _protocol(self, name: str, path: Path, *, many: bool) -> "ViewProtocol":
         from deltas_nets.evaluate.protocols.view_protocol import ViewProtocol

@@ -9,6 +9,7 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.terminal import warn
 
 if TYPE_CHECKING:
@@ -142,21 +143,3 @@ def sensible(config: Callable[..., T], **fields: Any) -> T:
         return config(**fields)
     except ValueError as error:
         raise UserError(str(error), "command line", "see --help of this command") from None
-
-
-def usable_device(name: str) -> str:
-    """The device of ``--device``; "auto" is a CUDA device where there is one.
-
-    Raises:
-        UserError: nothing can be computed there.
-    """
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"cannot compute there ({reason})", f"--device {name}", "use cpu") from None
-    return name

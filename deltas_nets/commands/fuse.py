@@ -8,9 +8,10 @@ import tyro
 
 from deltas_nets.commands.command import Command
 from deltas_nets.commands.depth_telling import show_fused
-from deltas_nets.commands.flags import Flag, folder_for, opened, sensible, usable_device
+from deltas_nets.commands.flags import Flag, folder_for, opened, sensible
 from deltas_nets.commands.unused import refuse_unused
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.outputs.alone import Written
 from deltas_nets.terminal import counted, progress, warn
 
@@ -112,7 +113,7 @@ class Fuse(Command):
         """Fuse maps of a capture that is open."""
         from deltas_nets.fuse.config import FuseConfig
         from deltas_nets.fuse.fusing import fuse_capture
-        from deltas_nets.fuse.sources import Predicted, depth_source
+        from deltas_nets.fuse.sources import depth_source
 
         config = sensible(
             FuseConfig,
@@ -121,8 +122,8 @@ class Fuse(Command):
             least=self.least,
         )
         source = depth_source(capture, self.depths, min_confidence=self.min_confidence)
-        if isinstance(source, Predicted) and source.left_out is not None:
-            warn(source.left_out)
+        if source.doubt is not None:
+            warn(source.doubt)
         if len(source.ids) == 1 and config.neighbours:
             warn("there is one map, and none to compare it with")
             config = sensible(FuseConfig, voxel=self.voxel, neighbours=0)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from deltas_nets.commands.command import Command
-from deltas_nets.commands.flags import Flag, sensible, usable_device
+from deltas_nets.commands.flags import Flag, sensible
 from deltas_nets.commands.values import at_least_one, not_empty, not_negative
+from deltas_nets.extras import usable_device
 from deltas_nets.terminal import counted, progress, table_console
 
 if TYPE_CHECKING:

@@ -47,6 +47,10 @@ class DepthSource(Protocol):
         """What the depth depends on, for JSON."""
 
     @property
+    def doubt(self) -> str | None:
+        """A warning of frames that were to have depth and have none, if there are any."""
+
+    @property
     def least_confidence(self) -> float:
         """Of pixels that are used; 0 where all are."""
 
@@ -112,8 +116,8 @@ class Predicted:
         self.settings = {"depth": summary["settings"], "min_confidence": self._least / 255}
 
     @property
-    def left_out(self) -> str | None:
-        """A warning of frames that were to have a map and have none."""
+    def doubt(self) -> str | None:
+        """See `DepthSource`."""
         if not self._missing:
             return None
         waits = unfinished(self._folder)
@@ -160,7 +164,7 @@ class Sensed:
         if not capture.metric:
             what = "sensor depth is in metres, and the capture is not"
             raise UserError(what, capture.path, "say --scale METRES")
-        self.least_confidence = 0.0
+        self.doubt, self.least_confidence = None, 0.0
         self.doubtful: dict[str, float] = {}
         self.settings = {"depth": "sensor", "cameras": capture.fingerprint()}
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from deltas_geom.checks import check_kind
 from deltas_nets.captures.camera_sums import are_sums_of
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.ids import ids_in_words
@@ -49,6 +50,7 @@ def made_of(capture: Capture, folder: Path) -> MadeOf:
         UserError: the folder is none of `deltas depth`, its maps are of another capture, or there
             is not a single one.
     """
+    check_kind("capture", capture, Capture, "open_capture(PATH)")
     anchors = [views.anchor for views in recorded_view_sets(folder)]
     summary = read_summary(folder / SUMMARY) or {}
     capture = _as_recorded(capture, folder, summary)

@@ -42,8 +42,12 @@ def look(
 
     Raises:
         UserError: an image cannot be read.
-        TypeError: the network gives something else than a map of the size that was asked for.
+        TypeError: no `Predictor`, or one that gives something else than a map of the size that was
+            asked for.
     """
+    if not hasattr(predictor, "depth_map"):
+        given = type(predictor).__name__
+        raise TypeError(f"network must be a Predictor, got {given}: use load_predictor(NAME)")
     unit = reach.unit
     config = replace(config, depth_range=(reach.near * unit, reach.far * unit))
     anchor, *others = map(straight, frames)

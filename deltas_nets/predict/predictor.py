@@ -13,6 +13,7 @@ from deltas_nets.config.baselines import BASELINES
 from deltas_nets.config.lookup import look_up
 from deltas_nets.config.varied import NetworkSettings
 from deltas_nets.errors import UserError
+from deltas_nets.extras import usable_device
 from deltas_nets.network.deltas import Deltas
 from deltas_nets.network.known_depth import KnownDepth
 from deltas_nets.predict.dense import DensePredictor
@@ -130,12 +131,12 @@ def load_predictor(
 
     Args:
         name_or_file: what the file holds is read from it, not from its name.
-        device: where to put it.
+        device: where to put it; "auto" is a CUDA device where there is one.
         precision: of the weights; geometry stays in float32.
 
     Raises:
-        UserError: no such file, or it holds none of these, or not all of its weights, or the
-            network does not run in this precision.
+        UserError: no such file or device, or the file holds none of these, or not all of its
+            weights, or the network does not run in this precision.
         ValueError: no such precision.
 
     Example:
@@ -144,6 +145,7 @@ def load_predictor(
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision must be one of {get_args(Precision)}, got {precision!r}")
+    device = usable_device(device)
     if name_or_file in BASELINES:
         _check_float32(precision, str(name_or_file))
         baseline: Predictor = look_up("deltas_nets.baselines", BASELINES[str(name_or_file)])(device)

@@ -5,6 +5,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from deltas_geom.checks import check_kind
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.centres import camera_centres
 from deltas_nets.captures.frame import FloatArray, Frame
@@ -71,10 +72,10 @@ class Asked:
         depth_range: tuple[float, float],
         measured: Measured | None = None,
     ) -> None:
+        self.measured = _Known(capture, measured)
         near, far = depth_range
         unit = 1.0 if capture.metric else (ROOM[0] * ROOM[1] / (near * far)) ** 0.5
         self.capture, self.reach = capture, Reach(near, far, unit)
-        self.measured = _Known(capture, measured)
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
@@ -98,8 +99,8 @@ class Followed:
     def __init__(
         self, capture: Capture, measured: Measured | None = None, *, as_rooms: bool = True
     ) -> None:
-        self.capture, self.as_rooms = capture, as_rooms and capture.metric
         self.measured = _Known(capture, measured)
+        self.capture, self.as_rooms = capture, as_rooms and capture.metric
 
     def __call__(self, predictor: Predictor, views: ViewSet, config: PredictConfig) -> Found:
         """See `Search`."""
@@ -190,6 +191,7 @@ class _Known:
     """What is measured of an anchor."""
 
     def __init__(self, capture: Capture, measured: Measured | None) -> None:
+        check_kind("capture", capture, Capture, "open_capture(PATH)")
         self.position = {id: position for position, id in enumerate(capture.frames)}
         self._measured = measured
 

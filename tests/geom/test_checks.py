@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from deltas_geom import Lens, ShapeError, pixel_grid, rasterize_depth, undistort
 from deltas_geom.checks import (
     batch_shape,
     check_bool,
+    check_counts,
     check_depth_range,
     check_image_size,
     check_shapes,
@@ -32,6 +34,20 @@ def test_too_few_dims_are_named() -> None:
 def test_a_letter_has_one_size_in_all_tensors() -> None:
     with pytest.raises(ShapeError, match="weights has V = 2 but proj has V = 3"):
         check_shapes(proj=(torch.zeros(3, 3, 4), "V 3 4"), weights=(torch.zeros(2, 5), "V N"))
+
+
+class Symbol(torch.SymInt):
+    """A size of a program that is exported: it has no value yet."""
+
+    def __init__(self) -> None: ...
+
+    def __lt__(self, other: object) -> bool:
+        return False
+
+
+@pytest.mark.parametrize("count", [2, np.int32(2), torch.tensor(2), (2, 3), Symbol()], ids=type)
+def test_a_count_may_be_of_any_whole_kind_and_a_symbol(count: Any) -> None:
+    check_counts(2, count=count)
 
 
 def test_leading_dims_are_free() -> None:

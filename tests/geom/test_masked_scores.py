@@ -72,5 +72,5 @@ def test_scores_that_are_not_finite_are_samples_not_seen(value: float) -> None:
 
 
 def test_a_window_is_not_negative() -> None:
-    with pytest.raises(ValueError, match="window must not be negative, got -1"):
+    with pytest.raises(ValueError, match="window must be 0 or more, got -1"):
         soft_argmax(torch.zeros(3), torch.zeros(3, 1), window=-1)

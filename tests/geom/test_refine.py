@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from deltas_geom import ShapeError, project, refine_points, reprojection_residual
 from deltas_geom.testing import PosedScene, forward_motion, right_angle
+from deltas_geom.testing.fixed_scenes import seeded_scene
 from deltas_geom.testing.strategies import posed_scenes, vectors
 from deltas_geom.triangulation.refine import Loss
 
@@ -22,10 +23,23 @@ def test_wrong_arguments_are_named() -> None:
         refine_points(proj, pixels, points, loss="l1")
     with pytest.raises(ValueError, match="or 'implicit', got 'none'"):
         refine_points(proj, pixels, points, gradient="none")
-    with pytest.raises(ValueError, match="steps must not be negative, got -1"):
+    with pytest.raises(ValueError, match="steps must be 0 or more, got -1"):
         refine_points(proj, pixels, points, steps=-1)
     with pytest.raises(ValueError, match="scale must be positive, got 0"):
         refine_points(proj, pixels, points, scale=0)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_where_nothing_or_everything_is_far_answers_are_numbers(loss: Loss) -> None:
+    scene = seeded_scene(3, num_views=4, noise=1.0)
+    pixels, start = scene.pixels.clone().requires_grad_(), scene.points + 0.05
+    wanted = refine_points(scene.views.proj, pixels, start, steps=3)
+    for scale in (torch.inf, 1e200, 1e-200):
+        found = refine_points(scene.views.proj, pixels, start, steps=3, loss=loss, scale=scale)
+        assert found.valid.all()
+        assert torch.autograd.grad(found.points.sum(), pixels)[0].isfinite().all()
+        if scale > 1:
+            assert_close(found.points, wanted.points, rtol=0, atol=1e-9)  # m
 
 
 @given(drawn=near_misses(), steps=st.integers(0, 4), loss=st.sampled_from(LOSSES))

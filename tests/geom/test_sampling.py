@@ -48,7 +48,7 @@ def segments_of(scene: PosedScene, near: float = 0.7, far: float = 20.0) -> Segm
 def test_wrong_arguments_are_named() -> None:
     scene = forward_motion()
     segments = segments_of(scene)
-    with pytest.raises(ValueError, match="num_samples must be at least 2, got 1"):
+    with pytest.raises(ValueError, match="num_samples must be 2 or more, got 1"):
         sample_segments(segments, 1)
     with pytest.raises(ValueError, match="spacing must be 'inv_depth' or 'pixels', got 'depth'"):
         sample_segments(segments, 4, spacing="depth")

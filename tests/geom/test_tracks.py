@@ -56,7 +56,7 @@ def test_wrong_arguments_are_named() -> None:
         triangulate_tracks(proj, pixels, index, index, 1, torch.ones(1, 5))
     with pytest.raises(TypeError, match=r"proj must be floating point, got torch\.int64"):
         triangulate_tracks(proj.long(), pixels, index, index, 1)
-    with pytest.raises(ValueError, match="num_points must not be negative, got -1"):
+    with pytest.raises(ValueError, match="num_points must be 0 or more, got -1"):
         triangulate_tracks(proj, pixels, index, index, -1)
     for cameras, points in ((index + 2, index), (index, index + 1), (index - 1, index)):
         with pytest.raises((IndexError, RuntimeError)):

@@ -202,6 +202,38 @@ OF_OTHER_KIND: dict[str, Callable[[Any], Any]] = {
         g.Lens(POSED.K, torch.zeros(0), "PINHOLE"), torch.zeros(3, 4, 4), mode="x"
     ),
     "depth_range must be (near, far)": lambda g: g.triangulate(PROJ, PIXELS).within_depth(10.0),
+    "proj must be a torch.Tensor, got NoneType": lambda g: g.triangulate(None, PIXELS),
+    "rays must be a torch.Tensor, got NoneType": lambda g: g.triangulate_rays(POSED[1], None),
+    "point_index must be a torch.Tensor, got NoneType": lambda g: g.triangulate_tracks(
+        PROJ, PIXELS[0, :2], torch.arange(2), None, 1
+    ),
+    "weights must be a torch.Tensor, got NoneType": lambda g: g.track_covariance(
+        PROJ, PIXELS[..., :1, 0], torch.arange(2), torch.arange(2), None
+    ),
+    "steps must be whole, got 1.5": lambda g: g.refine_points(
+        PROJ, PIXELS, torch.ones(6, 3), steps=1.5
+    ),
+    "min_inliers must be whole, got 2.5": lambda g: g.triangulate_robust(
+        PROJ, PIXELS, min_inliers=2.5
+    ),
+    "max_pairs must be whole, got 9.0": lambda g: g.triangulate_robust(PROJ, PIXELS, max_pairs=9.0),
+    "num_points must be whole, got 1.0": lambda g: g.triangulate_tracks(
+        PROJ, PIXELS[0, :2], torch.arange(2), torch.arange(2), 1.0
+    ),
+    "window must be whole, got 1.5": lambda g: g.soft_argmax(
+        torch.zeros(3), torch.zeros(3, 1), window=1.5
+    ),
+    "num_samples must be whole, got 8.0": lambda g: g.EpipolarSampler(8.0, depth_range=RANGE),
+    "depth_range must be (near, far) with": lambda g: g.EpipolarSampler(8, depth_range=(2, 1)),
+    "offsets must be finite, got (nan,)": lambda g: g.EpipolarSampler(
+        8, depth_range=RANGE, offsets=(float("nan"),)
+    ),
+    "spacing must be 'inv_depth' or 'pixels', got 'x'": lambda g: g.EpipolarSampler(
+        8, depth_range=RANGE, spacing="x"
+    ),
+    "reduce must be 'front' or 'mean', got 'x'": lambda g: g.DepthRasterizer(reduce="x"),
+    "splat must be 'pixel' or 'bilinear', got 'x'": lambda g: g.DepthRasterizer(splat="x"),
+    "tolerance must not be negative, got -1": lambda g: g.is_rigid(POSED[1], tolerance=-1),
     "samples has sources = 1 but feature_map has sources = 2": lambda g: g.correlate(
         torch.zeros(6, 8),
         torch.zeros(2, 8, 5, 5),

@@ -1,5 +1,6 @@
 """What a person at a prompt meets: completion, how objects print, and slips of arguments."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,19 @@ import torch
 
 import deltas_nets
 from deltas_geom import PosedViews
-from deltas_nets import Deltas, NetworkConfig, load_predictor
+from deltas_nets import Deltas, NetworkConfig, load_model, load_predictor
 from deltas_nets.captures.frame import Frame
 from deltas_nets.captures.frames import Frames
+from deltas_nets.captures.saving import save_capture
+from deltas_nets.captures.view_choice import choose_view_sets
+from deltas_nets.check.verdict import check_capture
+from deltas_nets.errors import UserError
 from deltas_nets.network.known_depth import KnownDepth
+from deltas_nets.outputs.their_capture import made_of
 from deltas_nets.predict.depth_map import PredictConfig
+from deltas_nets.predict.look import look
+from deltas_nets.predict.reach import Reach
+from deltas_nets.predict.search import Asked, Followed
 
 K, POSES = torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4)
 KNOWN = KnownDepth(torch.ones(1, 4, 4), torch.ones(1, 4, 4))
@@ -73,6 +82,28 @@ def test_slips_of_names_are_told() -> None:
     precision: Any = "float16"
     with pytest.raises(ValueError, match=r"precision must be one of .*bfloat16.*'float16'"):
         load_predictor("deltas-small", precision=precision)
+    with pytest.raises(UserError, match=r"cannot compute there \(.*, --device gpu: use cpu"):
+        load_model(device="gpu")
+    with pytest.raises(UserError, match=r"cannot compute there \(.*, --device gpu: use cpu"):
+        load_predictor("plane-sweep", "gpu")
     name: Any = "deltas-small"
     with pytest.raises(TypeError, match=r"config must be NetworkConfig.*use load_model"):
         Deltas(name)
+
+
+def test_what_is_no_capture_and_no_network_is_told(tmp_path: Path) -> None:
+    path: Any = tmp_path
+    doors: list[Callable[[], object]] = [
+        lambda: choose_view_sets(path, 3),
+        lambda: Followed(path),
+        lambda: Asked(path, (0.5, 9.0)),
+        lambda: made_of(path, path),
+        lambda: save_capture(path, path / "out"),
+        lambda: check_capture(path, path),
+    ]
+    for door in doors:
+        with pytest.raises(TypeError, match=r"capture must be Capture, got .*: use open_capture"):
+            door()
+    network: Any = Deltas(NetworkConfig())
+    with pytest.raises(TypeError, match="must be a Predictor, got Deltas: use load_predictor"):
+        look(network, [], PredictConfig(), Reach(0.5, 9.0, 1.0))

@@ -53,5 +53,6 @@ def test_a_slip_is_told_in_words_with_its_line_whoever_reads_it(
         with pytest.raises(UserError, match=r"line \d+, column \d+: ") as error:
             read(file)
         assert SLIPS[text] in str(error.value) and error.value.where == file
+        assert not error.value.remedy.endswith(" it"), "the file's name stands before: delete it?"
         found.append(error.value.what.rpartition("(")[2])
     assert len(set(found)) == 1

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -110,11 +110,25 @@ def test_without_agreement_it_is_said(run: Run, capture: Path, tmp_path: Path) -
     assert_one_line(run("convert", capture, tmp_path / "out", "--points", 0), "--points 0")
 
 
-def test_points_of_maps_in_floats_go_into_a_model(run: Run, capture: Path, tmp_path: Path) -> None:
+def test_points_of_maps_in_floats_go_into_a_model(
+    run: Run,
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     options = OutputOptions(depth_format="npz")
     maps = write_maps(capture, tmp_path / "maps", depth=wall, options=options)
+
+    def saving(*told: Any, **more: Any) -> list[str]:
+        """The reader of what is printed may have had enough of it."""
+        assert "points" not in capfd.readouterr().out
+        return save_capture(*told, **more)
+
+    monkeypatch.setattr("deltas_nets.captures.saving.save_capture", saving)
     said = run("convert", capture, tmp_path / "model", "--to", "colmap", "--depths", maps)
     assert said.code == 0, said.err
+    assert "points that two maps or more agree on\n" in said.out
     points = open_capture(tmp_path / "model").points
     assert points is not None and len(points.xyz) > 100
 

@@ -36,11 +36,9 @@ def tangent_ratio(squared: Tensor) -> Tensor:
 
 
 def angle_ratio(squared: Tensor, z: Tensor) -> Tensor:
-    """a / r, where a is the angle between the z axis and a point at a distance r from it.
+    """a / r of r^2 and z, a being the angle from the z axis to a point r from it.
 
-    Args:
-        squared: of r; positive where z is not.
-        z: along the axis.
+    r is positive where z is not.
     """
     small = (squared < _SMALL * z * z) & (z > 0)
     forward = torch.where(small, z, 1.0)

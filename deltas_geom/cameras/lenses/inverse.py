@@ -35,13 +35,8 @@ class Undistorted(NamedTuple):
 
 @without_gradients
 def undistort(terms: Terms, u: Tensor, v: Tensor, within: Tensor) -> Undistorted:
-    """The points that go to (u, v), and whether there is one within the disc that is one to one.
-
-    Args:
-        terms: of the distortion.
-        u: ``(*B, N)``.
-        v: ``(*B, N)``.
-        within: ``(*B, 1)`` from :func:`one_to_one_within`.
+    """The points that go to (u, v), each ``(*B, N)``, and whether there is one ``within`` the disc
+    of :func:`one_to_one_within`.
     """
     first = _solve(terms, u, v, within)
     if surely_all(first.found):

@@ -182,13 +182,8 @@ def rays_around_axis(
 ) -> RaysOfMany | None:
     """The function of pixels, if there is a table for most of them.
 
-    Args:
-        model: whose rays turn with their places around the axis.
-        K: ``(3, 3)``, finite.
-        coefficients: each ``(1,)``.
-        reach: ``(R,)`` of the model.
-        pixels: ``(*B, N, 2)``, of which some tell how far the table goes.
-        others: rays of pixels that the table does not hold.
+    Of a finite K ``(3, 3)`` and coefficients ``(1,)`` each, of a model whose rays turn with their
+    places around the axis. Some pixels tell how far the table goes; ``others`` takes the rest.
     """
     plain = K.numpy()
     unit = 1.0 if model.undone else float(plain[0, 0])

@@ -38,14 +38,9 @@ class Table(NamedTuple):
     ends: float
 
     def read(self, squared: Array, place: Array, index: Array, work: Array, out: Array) -> None:
-        """Values at squared radii, into ``out``; from ``exact`` on those of places before it.
+        """Values at squared radii ``(N,)``, into ``out``; from ``exact`` on those of places before.
 
-        Args:
-            squared: ``(N,)`` not negative.
-            place: ``(N,)`` to work in.
-            index: ``(N,)`` integers of a pointer's size, to work in.
-            work: ``(N,)`` to work in.
-            out: ``(N,)``.
+        All others are to work in; ``index`` holds integers of a pointer's size.
         """
         np.multiply(squared, self.per_unit, out=place)
         np.floor(place, out=work)
@@ -64,11 +59,8 @@ def table_of(
 ) -> Table | None:
     """The table of a function of a squared radius, or None where it has no piece to be read.
 
-    Args:
-        function: from squared radii ``(N,)``, positive and ascending, values and whether there is
-            one; what has none comes after what has.
-        end: of the squared radii.
-        tolerance: of what is read, relative.
+    From squared radii ``(N,)``, positive and ascending, it gives values and whether there is one;
+    what has none comes after what has. The tolerance is relative.
     """
     places, to_series, to_pieces = _matrices()
     squared = ((np.arange(_PANELS)[:, None] + places) * (end / _PANELS)).ravel()

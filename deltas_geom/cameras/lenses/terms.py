@@ -148,11 +148,8 @@ def one_to_one_within(terms: Terms, most: float = math.inf) -> Tensor:
     In it the symmetric part of the derivative is positive definite, and a map of a convex domain
     of which this holds takes no value twice. Without other terms than radial ones it ends
     exactly where r g(r^2) turns back, or has a pole; a tangential vector p takes 6 |p| r from the
-    derivative where it takes most, a prism 2 |s1| r + 4 |s2| r^3.
-
-    Args:
-        terms: of the distortion, all finite.
-        most: the radius where nothing turns back; pi for angles.
+    derivative where it takes most, a prism 2 |s1| r + 4 |s2| r^3. ``most`` is the radius where
+    nothing turns back; pi for angles.
     """
     limit = min(most, _FARTHEST)
     one = torch.ones_like(next(c for part in terms for c in part))

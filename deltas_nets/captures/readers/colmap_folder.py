@@ -151,9 +151,8 @@ def _folders_in(path: Path) -> tuple[list[Path], int]:
 
 def _has_other_poses(folder: Path) -> bool:
     """Whether this is ScanNet's layout, whose poses are metric, whatever else it holds."""
-    return os.path.isdir(
-        folder / "pose"
-    )  # unlike pathlib's, without an error where we may not look
+    # Unlike pathlib's, without an error where we may not look.
+    return os.path.isdir(folder / "pose")
 
 
 def _is_model(path: Path) -> bool:

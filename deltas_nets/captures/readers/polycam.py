@@ -79,21 +79,19 @@ def read(path: Path) -> Capture:
 
 
 def _keyframes(path: Path) -> tuple[Path, Path] | None:
-    """The folders of cameras and of images, optimised ones first."""
-    for folder in (path / "keyframes", path):
-        for cameras, images in _KINDS:
-            both = folder / cameras, folder / images
-            if both[0].is_dir() and both[1].is_dir() and _holds_json(both[0]):
-                return both
-    alone = (path / "keyframes", *([path] if path.name == "keyframes" else []))
-    without = (
-        (folder / cameras, folder / images) for folder in alone for cameras, images in _KINDS
-    )
-    return next((both for both in without if both[0].is_dir() and _holds_json(both[0])), None)
+    """The folders of cameras and of images, optimised ones first.
 
-
-def _holds_json(folder: Path) -> bool:
-    return next(listed(folder, ".json"), None) is not None
+    Of a folder of Polycam's name, which holds nothing else, cameras are told without images, too.
+    """
+    found = [
+        (folder / cameras, folder / images)
+        for folder in (path / "keyframes", path)
+        for cameras, images in _KINDS
+        if (folder / cameras).is_dir() and any(listed(folder / cameras, ".json"))
+    ]
+    whole = [both for both in found if both[1].is_dir()]
+    own = [both for both in found if both[0].parent.name == "keyframes"]
+    return next(iter(whole + own), None)
 
 
 def _K(fields: Fields) -> FloatArray:

@@ -33,13 +33,13 @@ class LiteEncoder(ImageEncoder):
         Raises:
             TypeError: it does not.
         """
-        cls._states(cls, channels="channels = Channels(...)", origin="origin = Origin(...)")
+        cls._check_stated(cls, channels="channels = Channels(...)", origin="origin = Origin(...)")
         encoder = cls()
-        cls._states(encoder, fine="self.fine = self.fine_branch(), last in __init__")
+        cls._check_stated(encoder, fine="self.fine = self.fine_branch(), last in __init__")
         return encoder
 
     @classmethod
-    def _states(cls, stating: object, **lines: str) -> None:
+    def _check_stated(cls, stating: object, **lines: str) -> None:
         for name, line in lines.items():
             if not hasattr(stating, name):
                 raise TypeError(f"the encoder {cls.__name__} has no {name}: write {line}")
