@@ -67,7 +67,7 @@ class Reader(Protocol):
 
 @runtime_checkable
 class ReaderOfPoses(Protocol):
-    """What the reader of a format without intrinsics defines besides."""
+    """What a reader defines besides that asks no file for a camera which the user states."""
 
     def read_with(self, path: Path, intrinsics: Intrinsics | None) -> Capture:
         """Read poses and images of a camera that the user states, as `Reader.read` does."""

@@ -23,6 +23,9 @@ __all__ = ["ChosenViews", "choose_view_sets", "choose_views", "spread_sources"]
 
 PROBE_DEPTHS = (0.4, 0.8, 1.6)
 """Where surfaces may be, in working depths: overlap is the mean over these."""
+NEAR_PROBE = 0.2
+"""Where few surfaces are, but the first to leave the images of a camera that walks ahead: a second
+source gains by what it sees there, and no source is refused for what it does not."""
 PROBES_ACROSS = 8  # columns and rows of anchor pixels probed
 MAX_POINTS = 256  # sparse points that are probed in their place where the anchor sees some
 
@@ -37,7 +40,7 @@ MAX_ROLL = np.radians(45)
 """Images turned farther about the axis, as portrait is beside landscape, hardly match."""
 GOOD_ANGLE = np.radians(15)  # where the penalty of the viewing angle reaches exp(-1/2)
 NEAREST = 0.04  # in working depths; what is nearer to a candidate does not count as seen
-COVERAGE = 6.0
+COVERAGE = 12.0
 """How much a source gains by the log of the part of the anchor that is seen with it, by the part
 that is seen without."""
 MAX_CANDIDATES = 48  # frames scored by projection for each anchor, where no more are wanted
@@ -114,12 +117,13 @@ def choose_views(
         anchor = index_of[id]
         depth = float(depths[anchor]) if depths is not None else working_depth or 0.0
         near = _candidates(centres, poses[:, :3, :3], anchor, depth, num_views - 1)
-        probes, nearest = _probes(capture, anchor, depth), NEAREST * depth
+        (probes, rated), nearest = _probes(capture, anchor, depth), NEAREST * depth
         seen = seen_places(capture.frames, near, probes, poses[anchor], nearest=nearest)
+        overlap = seen[:, :rated].mean(axis=-1)
         offsets = (centres[near] - centres[anchor]) @ poses[anchor, :3, :3].T
         angles = _angles(poses[near, 2, :3], poses[anchor, 2, :3])
         rolls = _rolls(poses[near, :3, :3], poses[anchor, :3, :3])
-        log_score, hindered = _rate(offsets, angles, rolls, seen.mean(axis=-1), depth)
+        log_score, hindered = _rate(offsets, angles, rolls, overlap, depth)
         acceptable = hindered == ""
         if acceptable.sum() < min(num_views, len(ids)) - 1:
             short[Counter(hindered[~acceptable]).most_common(1)[0][0]] += 1
@@ -177,16 +181,22 @@ def _baseline_log_score(baseline: FloatArray) -> FloatArray:
     return score
 
 
-def _probes(capture: Capture, anchor: int, working_depth: float) -> FloatArray:
-    """Places ``(3, P)`` in the anchor's camera where surfaces are, or may be."""
+def _probes(capture: Capture, anchor: int, working_depth: float) -> tuple[FloatArray, int]:
+    """Places ``(3, P)`` in the anchor's camera where surfaces are, or may be.
+
+    Besides, how many of them, from the first on, overlap is the mean of.
+    """
     points = points_in_view(capture, anchor)
     if points is not None:
-        return points[:: 1 + len(points) // MAX_POINTS].T
+        points = points[:: 1 + len(points) // MAX_POINTS]
+        return points.T, len(points)
     height, width = capture.frames.image_sizes[anchor]
     parts = (np.arange(PROBES_ACROSS) + 0.5) / PROBES_ACROSS
     x, y = np.meshgrid(parts * width - 0.5, parts * height - 0.5)
     rays = _rays(capture, anchor, np.stack([x.ravel(), y.ravel()]))
-    return np.concatenate([rays * depth * working_depth for depth in PROBE_DEPTHS], axis=1)
+    depths = (*PROBE_DEPTHS, NEAR_PROBE)
+    places = np.concatenate([rays * depth * working_depth for depth in depths], axis=1)
+    return places, rays.shape[1] * len(PROBE_DEPTHS)
 
 
 def _rays(capture: Capture, position: int, pixels: FloatArray) -> FloatArray:

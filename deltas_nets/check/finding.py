@@ -50,6 +50,7 @@ class Fault(Enum):
     CENTERS_AS_TRANSLATIONS = "translations and camera centres are mixed up"
     POSES_OF_OTHER_FRAMES = "poses belong to other frames"
     FRAMES_DISAGREE = "the poses of some frames disagree with all others"
+    POSES_SHAKE = "poses are each a little off"
     NOT_METRES = "the unit of the poses is not the metre"
     WRONG_SCALE = "poses and sensor depth differ in scale"
     DEPTH_SCALE = "the unit of sensor depth is not the one stated"

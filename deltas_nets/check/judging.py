@@ -22,6 +22,7 @@ from deltas_nets.check.mending import leaving_out
 from deltas_nets.check.quaternions import other_quaternions
 from deltas_nets.check.scale import wrong_scale
 from deltas_nets.check.sensor import sensors
+from deltas_nets.check.shaky import shaky_poses
 from deltas_nets.check.time_shift import poses_of_other_frames
 from deltas_nets.check.trying import ENOUGH, Case
 from deltas_nets.check.turned import turned_images, turned_images_of_right_K
@@ -139,7 +140,8 @@ def _explained(case: Case) -> list[Finding]:
         return [_apart(capture, matched, evidence, strict, apart)]
     if level(given) > ENOUGH:
         return [_unexplained(diagnosis, matched, capture)]
-    return []
+    shaky = shaky_poses(case)
+    return [] if shaky is None else [shaky]
 
 
 def _no_baseline(diagnosis: Diagnosis) -> Finding:

@@ -55,6 +55,15 @@ def _moved(pose: np.ndarray) -> np.ndarray:
     return pose
 
 
+def shaken(pose: np.ndarray) -> np.ndarray:
+    """Each turned by 0.6 degrees or so, about axes of its own."""
+    random = np.random.default_rng(0)
+    halves = random.normal(0, 0.003, (len(pose), 3))
+    turns = rotations_of(np.concatenate([np.ones((len(pose), 1)), halves], axis=-1))
+    pose[:, :3] = turns @ pose[:, :3]
+    return pose
+
+
 def _rotations_inverted(pose: np.ndarray) -> np.ndarray:
     """Centres stay where they are."""
     world_from_cam = np.linalg.inv(pose)

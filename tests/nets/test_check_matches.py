@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from check_plants import MATCHES, with_depth_of_a_kinect
+from check_plants import MATCHES, poses, shaken, with_depth_of_a_kinect
 from room_capture import write_scene
 
 from deltas_nets.captures.capture import Capture
@@ -107,6 +107,13 @@ def test_a_room_that_is_well_raises_no_alarm(look: Look) -> None:
 )
 def test_faults_planted_in_a_room_are_named_and_mended(name: str, look: Look) -> None:
     assert_named_and_mended(look("room"), name)
+
+
+def test_poses_that_are_each_a_little_off_are_told(look: Look) -> None:
+    looked = look("room")
+    (found,) = looked.judged(poses(shaken)(looked.capture))
+    assert found.cause is Fault.POSES_SHAKE and found.severity == "warning" and not found.frames
+    assert "degrees of its own" in found.evidence and "bundle adjustment" in found.cure
 
 
 def test_depth_of_another_camera_in_a_room_is_named(look: Look, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_capture import write_capture
 from written_captures import NUM, WRITERS, Scene, Written, make_scene, tum
 from written_data_sets import DATA_SETS
 
@@ -121,6 +122,23 @@ def test_intrinsics_are_taken_from_the_user_first(scene: Scene, tmp_path: Path) 
         path = WRITERS[layout](tmp_path / layout, scene).path
         frame = open_capture(path, intrinsics=stated).frames.at(0)
         assert np.array_equal(frame.K, stated.K) and frame.lens is None
+
+
+def test_a_file_of_intrinsics_that_is_refused_is_not_asked_where_the_user_states_them(
+    scene: Scene, tmp_path: Path
+) -> None:
+    stated, corner = Intrinsics.parse("70 71 -30 -20"), "70 0 -30 0 71 -20 0 0 1"
+    demon = WRITERS["DeMoN"](tmp_path / "demon", scene).path
+    exported = write_capture(tmp_path / "exported")
+    files = [exported / "intrinsic" / f"intrinsic_{of}.txt" for of in ("color", "depth")]
+    for file in (demon / "cam.txt", *files):
+        file.write_text(corner)
+    for path in (demon, exported):
+        with pytest.raises(UserError) as error:
+            open_capture(path)
+        assert "--intrinsics" in error.value.remedy
+        frame = open_capture(path, intrinsics=stated).frames.at(0)
+        assert np.array_equal(frame.K, stated.K) and frame.lens is None and frame.depth_K is None
 
 
 def test_tum_without_a_camera_names_the_option(scene: Scene, tmp_path: Path) -> None:

@@ -141,9 +141,12 @@ def test_sources_lie_on_both_sides_of_the_anchor() -> None:
     assert len({int(source) < 2 for source in chosen.sources}) == 2
 
 
-def test_of_a_camera_that_walks_ahead_a_source_is_near_enough_to_see_what_the_anchor_sees() -> None:
+@pytest.mark.parametrize(("sideways", "ahead"), [(0.003, 0.04), (0.006, 0.03)])
+def test_of_a_camera_that_walks_ahead_a_source_is_near_enough_to_see_what_the_anchor_sees(
+    sideways: float, ahead: float
+) -> None:
     steps = np.arange(20)
-    capture = row_of_cameras(np.stack([0.003 * steps**2, 0 * steps, 0.04 * steps], axis=-1))
+    capture = row_of_cameras(np.stack([sideways * steps**2, 0 * steps, ahead * steps], axis=-1))
     (chosen,) = choose_view_sets(capture, 3, anchors=[0])
     first, second = map(int, chosen.sources)
     # By baseline alone the second would be farther than the first, and see less still.

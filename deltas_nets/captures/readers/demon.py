@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture
 from deltas_nets.captures.frame import FloatArray
 from deltas_nets.captures.readers.collected import Collected
@@ -15,7 +16,7 @@ from deltas_nets.captures.readers.poses import cam_from_world
 from deltas_nets.captures.text_lines import read_lines
 from deltas_nets.errors import UserError
 
-__all__ = ["read", "recognises"]
+__all__ = ["read", "read_with", "recognises"]
 
 _REMEDY = "write a line of 12 numbers for each image, world-to-camera"
 
@@ -27,11 +28,18 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Capture:
     """Read one scene; see `deltas_nets.captures.opening.Reader` for the contract."""
+    return read_with(path, None)
+
+
+def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
+    """Read one scene; see `deltas_nets.captures.opening.ReaderOfPoses` for the contract."""
     file = path / "poses.txt"
     rows = _rows(file)
     images = numbered_files(path, (".jpg", ".jpeg", ".png"))
     depths = numbered_files(path, (".npy",))
-    K = read_intrinsics(path / "cam.txt", size_of_first(images.values()))
+    if intrinsics is None:
+        K = read_intrinsics(path / "cam.txt", size_of_first(images.values()))
+        intrinsics = Intrinsics(K, None)
     found = Collected(path)
     for number in sorted(images.keys() | set(range(len(rows)))):
         id = f"{number:04d}"
@@ -42,7 +50,7 @@ def read(path: Path) -> Capture:
         photo = found.photo(id, images.get(number))
         if photo is not None:
             pose = cam_from_world(rows[number].reshape(3, 4), id=id, path=file)
-            found.add(photo, pose, K, depth=depths.get(number))
+            found.add(photo, pose, intrinsics.K, lens=intrinsics.lens, depth=depths.get(number))
     return found.capture(path, "DeMoN", metric=True)
 
 

@@ -13,7 +13,7 @@ __all__ = ["doubtful_centre", "read_intrinsics"]
 
 SPREAD = (0.35, 0.65)
 """Where a principal point lies, in parts of the image. Cameras are within 0.45 to 0.55; wider,
-because a refusal has no way around it. Images resized by 0.76 or 1.43 are found."""
+because a refusal stops everything. Images resized by 0.76 or 1.43 are found."""
 CENTRAL = 0.08
 """How far from the middle it lies at most, if nobody cropped; a turned 4:3 image puts it 0.12 off
 on both axes, others more."""
@@ -109,4 +109,5 @@ def _check_resolution(K: FloatArray, image_size: tuple[int, int], path: Path) ->
             f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) does not fit images of "
             f"{in_words(image_size)}: these intrinsics are of another resolution"
         )
-        raise UserError(what, path, "scale fx, fy, cx and cy to the images' size")
+        remedy = "scale fx, fy, cx and cy to the images' size; of a crop, state them: --intrinsics"
+        raise UserError(what, path, remedy)

@@ -2,11 +2,13 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from filecmp import cmp
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from deltas_nets.captures.camera_words import Intrinsics
 from deltas_nets.captures.capture import Capture, FloatArray, Frame, Lost
 from deltas_nets.captures.frames import Frames
 from deltas_nets.captures.readers.image_sizes import size_of_first
@@ -16,7 +18,7 @@ from deltas_nets.captures.readers.refused import known_layout
 from deltas_nets.captures.text_lines import read_numbers
 from deltas_nets.errors import UserError
 
-__all__ = ["NESTING", "is_scene", "read", "recognises"]
+__all__ = ["NESTING", "is_scene", "read", "read_with", "recognises"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NESTING = ("scans_test", "scans")
@@ -34,7 +36,7 @@ class _SceneFiles(NamedTuple):
         poses: pose files by frame number.
         depths: depth images by frame number; empty where there is no such folder.
         image_size: (height, width) of the colour images.
-        K: ``(3, 3)`` of the colour images.
+        camera: of the colour images.
         depth_K: ``(3, 3)`` of the depth images; None where they see what the images see.
         depth_size: (height, width) of the depth images; None if there are none that decode.
         doubts: what may be a mistake, each for a warning.
@@ -44,7 +46,7 @@ class _SceneFiles(NamedTuple):
     poses: Mapping[int, Path]
     depths: Mapping[int, Path]
     image_size: tuple[int, int]
-    K: FloatArray
+    camera: Intrinsics
     depth_K: FloatArray | None
     depth_size: tuple[int, int] | None
     doubts: tuple[str, ...]
@@ -60,8 +62,13 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Capture:
     """Read one scene; see `deltas_nets.captures.opening.Reader` for the contract."""
+    return read_with(path, None)
+
+
+def read_with(path: Path, intrinsics: Intrinsics | None) -> Capture:
+    """Read one scene; see `deltas_nets.captures.opening.ReaderOfPoses` for the contract."""
     scene = _find_scene(path)
-    files = _find_files(scene)
+    files = _find_files(scene, intrinsics)
     frames: list[Frame] = []
     lost: dict[str, Lost] = {}
     for number, image_path in files.images.items():
@@ -75,7 +82,8 @@ def read(path: Path) -> Capture:
                 id=str(number),
                 image_path=image_path,
                 image_size=files.image_size,
-                K=files.K,
+                K=files.camera.K,
+                lens=files.camera.lens,
                 cam_from_world=pose,
                 depth_path=depth_path,
                 depth_K=None if depth_path is None else files.depth_K,
@@ -108,11 +116,12 @@ def _read_pose(number: int, path: Path | None, scene: Path) -> FloatArray | Lost
         return Lost("not rigid", error)
 
 
-def _find_files(scene: Path) -> _SceneFiles:
+def _find_files(scene: Path, stated: Intrinsics | None) -> _SceneFiles:
     """The files of a scene by frame number, and its intrinsics.
 
     Args:
         scene: the folder that holds color, pose and intrinsic.
+        stated: what the user says that the colour images have; the file says it if None.
 
     Raises:
         UserError: a folder or the images are missing, no pose belongs to an image, or the
@@ -146,18 +155,24 @@ def _find_files(scene: Path) -> _SceneFiles:
         what = f"none of the {len(images)} images can be decoded"
         raise UserError(what, next(iter(images.values())), "copy the files again")
     file = scene / "intrinsic" / "intrinsic_color.txt"
-    K = read_intrinsics(file, image_size)
-    doubts = [_misnamed(scene / "color"), doubtful_centre(K, image_size, file)]
-    depth_size = size_of_first(depths.values())
-    depth_K = None
     depth_file = scene / "intrinsic" / "intrinsic_depth.txt"
+    depth_size = size_of_first(depths.values())
+    doubts = [_misnamed(scene / "color")]
+    own_camera = depths and depth_file.exists()
+    if stated is None:
+        stated = Intrinsics(read_intrinsics(file, image_size), None)
+        doubts.append(doubtful_centre(stated.K, image_size, file))
+    elif own_camera and depth_size == image_size:
+        # A file that is wrong of the images is as wrong of depth registered to them.
+        own_camera = not (file.is_file() and cmp(file, depth_file, shallow=False))
+    depth_K = None
     # Registered depth often comes without a file of its own: None says "as the colour image".
-    if depths and depth_file.exists():
+    if own_camera:
         depth_K = read_intrinsics(depth_file, depth_size)
     elif depth_size is not None:
         doubts.append(_other_shape(depth_size, image_size, depth_file))
     said = tuple(doubt for doubt in doubts if doubt is not None)
-    return _SceneFiles(images, poses, depths, image_size, K, depth_K, depth_size, said)
+    return _SceneFiles(images, poses, depths, image_size, stated, depth_K, depth_size, said)
 
 
 def is_scene(path: Path) -> bool:
