@@ -24,7 +24,7 @@ GROUPS = 6
 LEAST = 24  # matches with which two frames go together
 MOTION = 0.06  # of the width, wanted between neighbours in a group
 _LONGEST_STRIDE = 16
-_AHEAD = np.radians(10)  # frames turned by less look at the same
+_AHEAD = np.radians(25)  # frames turned by less look at the same
 
 
 class Matched(NamedTuple):
