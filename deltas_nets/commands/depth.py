@@ -119,9 +119,10 @@ class Depth(Captured, Measuring, Prediction):
         from deltas_nets.check.quick import TOLD_BEFORE, quick_findings
         from deltas_nets.outputs.prepare import check_place
         from deltas_nets.predict.capture import predict_capture
+        from deltas_nets.predict.depth_map import ENLARGED
 
         shard = read_shard(self.shard)
-        config = self.config(size=self.size, min_confidence=self.min_confidence)
+        config = self.config(size=self.size, min_confidence=self.min_confidence, enlarged=ENLARGED)
         options = asked_options(self.depth_scale, self.format)
         capture = self.opened(self.capture).remembering()
         check_place(self.folder, overwrite=self.overwrite, forbidden=capture.path)

@@ -19,6 +19,8 @@ from deltas_nets.network.prediction import DepthPrediction
 
 WORK_PIXELS = 120_000
 """Pixels of the image that the network usually sees; see decisions 5 and 26."""
+ENLARGED = 2.0
+"""How many times as long `deltas depth` makes the sides of smaller photos at most."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,9 @@ class PredictConfig:
     """(height, width) that the network sees; chosen to suit it if not given."""
     work_pixels: int = WORK_PIXELS
     """How many pixels that has at most, where it is chosen."""
+    enlarged: float = 1.0
+    """How many times as long the sides of photos of fewer than `WORK_PIXELS` become at most for it;
+    networks are scored on photos as they are."""
     size: tuple[int, int] | None = None
     """(height, width) of the maps; the colour image's own if not given."""
     min_confidence: float = 0.0
@@ -50,6 +55,8 @@ class PredictConfig:
                 isinstance(side, int | np.integer) and side >= 32 for side in size
             ):
                 raise ValueError(f"{name} must be HEIGHT WIDTH of 32 or more, got {size}")
+        if not 1 <= self.enlarged < np.inf:
+            raise ValueError(f"enlarged must be 1 or more, got {self.enlarged}")
         if not 0 <= self.min_confidence <= 1:
             raise ValueError(f"--min-confidence must be within 0 to 1, got {self.min_confidence}")
 

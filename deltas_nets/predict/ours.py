@@ -34,9 +34,6 @@ from deltas_nets.predict.encoded_frames import EncodedFrames
 from deltas_nets.predict.without_points import map_without_points
 from deltas_nets.weights_file import weights_record
 
-ENLARGED = 2.0
-"""How many times as long the sides of photos of fewer than `WORK_PIXELS` become at most: places are
-found to a part of what the network sees as a pixel; see decision 26."""
 POINT_PIXELS = 192
 """Pixels of an image for each point of a network with 768: of more pixels there are more points, or
 the densifier has too few of them; see decision 26."""
@@ -207,11 +204,12 @@ def complete_frame(
 
 
 def work_size_of(anchor: Frame, config: PredictConfig) -> tuple[int, int]:
-    """(height, width) that the network sees: of small photos more than they have."""
+    """(height, width) that the network sees."""
     if config.work_size is not None:
         return config.work_size
     height, width = anchor.image_size
-    enlarged = ENLARGED if height * width < WORK_PIXELS * anchor.extent else 1.0
+    # Places are found to a part of what the network sees as a pixel.
+    enlarged = config.enlarged if height * width < WORK_PIXELS * anchor.extent else 1.0
     most = round(config.work_pixels * anchor.extent)
     return fit_work_size(anchor.image_size, max_pixels=most, enlarged=enlarged)
 
