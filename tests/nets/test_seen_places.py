@@ -77,7 +77,7 @@ def test_through_a_lens_a_frame_sees_what_is_in_its_photo(lens: Lens) -> None:
     capture = Capture(Path(), frames, {}, points=untold(3 * places.T))
     points = points_in_view(capture, 0)
     assert points is not None and np.array_equal(points, 3 * places.T[found[1]])
-    probes = view_choice._probes(replace(capture, points=None), 0, 2.0)
+    probes, _ = view_choice._probes(replace(capture, points=None), 0, 2.0)
     assert in_images(frames, np.array([0]), probes[None]).all()
     assert np.ptp(probes[0] / probes[2]) > 0.75 * np.ptp(places[0, found[1] & near])
 
