@@ -94,6 +94,7 @@ OPTIONS = {
     "weights": "--weights",
     "view_sets": "--view-sets (a file's or chosen ones)",
     "work_pixels": "the size of images that a trial found, --work-size",
+    "enlarged": "how much small photos are enlarged, --work-size",
     "depth": "what made the maps",
     "cameras": "the capture or one of its cameras",
     "frames": "which frames have depth",

@@ -229,6 +229,7 @@ def test_maps_in_files_are_scored_scene_by_scene(
 ) -> None:
     for name in ("a", "b"):
         asked = ("--views", 2, "--depth-range", 0.5, 10, "--no-page", "--passes", 1)
+        asked += ("--work-size", 48, 64)  # networks are scored on small photos as they are
         out = tmp_path / "maps" / name
         assert run("depth", two_scenes / name, "--out", out, *asked).code == 0
     direct = evaluated(two_scenes, "--views", 2, "--consistency")
